@@ -63,6 +63,11 @@ def capture_of(optics: TiDyOptics, image: np.ndarray, depth: np.ndarray) -> np.n
         return optics(torch.from_numpy(image), torch.from_numpy(depth)[None]).numpy()
 
 
+@torch.no_grad()
+def psfs_of_states(optics: TiDyOptics) -> np.ndarray:
+    return np.stack([optics.through_state(k).psf_bank().psfs.numpy() for k in range(len(optics.masks.phase))])
+
+
 class TestOracle(BaseTester):
     """The oracle itself against closed forms and, if there is one, another model."""
 
@@ -219,8 +224,7 @@ class TestCaptures(BaseTester):
         ):
             fidelity = Fidelity(window=11, layers=layers, layer_spacing=13.4, stray_light=stray_light, double=True)
             optics = TiDyOptics(masks, None, DwellTimes(shares), None, fidelity, compositing, space, border)
-            bank = optics.with_fidelity(fidelity.replace(stray_light="discard")).psf_bank(states=True)
-            states = np.stack([state.psfs.detach().numpy() for state in bank])
+            states = psfs_of_states(optics.with_fidelity(fidelity.replace(stray_light="discard")))
             weights = oracle.layer_weights(psi, optics.defocus_nodes, layers)
             light = oracle.decode(image) if space == "srgb" else image
             expected = oracle.capture(light, weights, states, shares, compositing, border, stray_light)
@@ -249,8 +253,7 @@ class TestCaptures(BaseTester):
             spectrum=Spectrum(WAVELENGTHS, RESPONSE),
         )
         assert np.abs(np.array(optics.defocus_nodes) - nodes).max() < 1e-9
-        bank = optics.with_fidelity(fidelity.replace(stray_light="discard")).psf_bank(states=True)
-        difference = np.abs(np.stack([state.psfs.detach().numpy() for state in bank]) - states)
+        difference = np.abs(psfs_of_states(optics.with_fidelity(fidelity.replace(stray_light="discard"))) - states)
         off = float((difference.sum((-2, -1)) / states.sum((-2, -1))).max())
         assert off < PROMISED
         image, depth = scene()

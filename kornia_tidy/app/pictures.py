@@ -75,7 +75,8 @@ def masks_and_psfs(result: Result) -> Picture:
     masks = mask_colors(optics)
     count, shown = len(masks), min(len(masks), MOST_ROWS)
     if count > 1:
-        rows = [*optics.psf_bank(defocus=defocus.tolist(), states=True).psfs[:shown].flip(1), *rows]
+        states = [optics.through_state(k) for k in range(shown)]
+        rows = [*(one.psf_bank(defocus=defocus.tolist()).psfs.flip(0) for one in states), *rows]
     first, top = LEFT + CELL + MASK_SPACE, TITLE + HEAD
     canvas = np.ones((top + len(rows) * (CELL + GAP), first + COLUMNS * (CELL + GAP), 3), np.float32)
     for row, psfs in enumerate(rows):
@@ -120,7 +121,7 @@ def mask_colors(optics: TiDyOptics) -> list[NDArray[np.float32]]:
     from matplotlib import colormaps  # noqa: PLC0415
 
     phases = central_square(optics.masks.phase).detach().remainder(2 * math.pi) / (2 * math.pi)
-    amplitude = optics.pupil.amplitude.detach()
+    amplitude = optics.pupil.transmission
     cells = max(1, amplitude.shape[-1] // phases.shape[-1])
     open_ = avg_pool2d(amplitude[None, None].double(), cells)[0, 0] > 0
     found = []

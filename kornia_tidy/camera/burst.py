@@ -88,10 +88,10 @@ def burst(
         torch.Size([2, 3, 80, 80])
     """
     sample = read_sample(image, depth, optics)
-    shots = []
+    shots, light = [], optics.psf_model.relative_light(sample.dtype)
     for k, share in enumerate(burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)):
         shot = optics.through_moment(k).irradiance(sample)
-        shot = shot * share.to(shot)
+        shot = shot * (share * light[k]).to(shot)
         shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1).to(sample.image.dtype)
     return stack if sample.batched else stack[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any, Literal, NoReturn, Self, overload
+from typing import Any, NoReturn, Self
 
 import torch
 from torch import Tensor, nn
@@ -25,18 +25,18 @@ from kornia_tidy.psf.camera_settings import (
     take_over,
     write_settings,
 )
-from kornia_tidy.psf.field_bank import FieldBank, check_field
+from kornia_tidy.psf.field_bank import FieldBank
+from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.lens_limits import PARTS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.psf_window import FittedWindow
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.runtime.mode import refuse_torchscript
 
-_SUBMODULES = ("masks", "camera", "modulator", "lens")
+_SUBMODULES = ("masks", "camera", "modulator", "lens", "aperture")
 COLOR_SPACES = ("srgb", "linear", "paper")
 OWN_SETTINGS = ("sensor", "compositing", "color_space", "border")  # of a camera, beside those of its PSF model
 
@@ -53,9 +53,9 @@ def _part(name: str, meaning: str, *, settable: bool = False) -> Any:
 class CameraState(nn.Module):
     """A camera with a PSF model, and a ``state_dict`` of weights, settings and PSF window.
 
-    Masks, camera, modulator and lens of the model are its submodules, so that states hold ``masks.phase``, and
-    optimisers and ``to(device)`` reach the parts. To set one of them, or ``fidelity``, ``spectrum`` or ``aperture``,
-    puts another PSF model in the place of the present one.
+    Masks, camera, modulator, lens and a learnable aperture of the model are its submodules, so that states hold
+    ``masks.phase``, and optimisers and ``to(device)`` reach the parts. To set one of them, or ``fidelity``,
+    ``spectrum`` or ``aperture``, puts another PSF model in the place of the present one.
 
     The settings of its parts and its PSF window are one entry, ``_extra_state``, a tensor of bytes. Loading a state
 
@@ -79,8 +79,8 @@ class CameraState(nn.Module):
 
     fidelity: Fidelity = _part("fidelity", "How exactly to compute.", settable=True)
     spectrum: Spectrum = _part("spectrum", "Wavelengths, and how each channel weights them.", settable=True)
-    aperture: Tensor | None = _part(
-        "aperture", "Amplitude over the mask's pixels, None for the binary disc.", settable=True
+    aperture: Tensor | LearnableAperture | None = _part(
+        "aperture", "Amplitude over the mask's pixels, None for the binary disc; a module where it is learnt."
     )
     pupil: Pupil = _part("pupil", "The aperture over the masks' pixels.")
     defocus_nodes: tuple[float, ...] = _part(
@@ -94,16 +94,24 @@ class CameraState(nn.Module):
         super().__init__()
         self.psf_model = psf_model
         for name in _SUBMODULES:
-            super().__setattr__(name, getattr(psf_model, name))
+            self._take(name)
         self.register_load_state_dict_post_hook(_measure_window)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; masks, camera, modulator and lens are of the PSF model too."""
+        """Set an attribute; masks, camera, modulator, lens and aperture are of the PSF model too."""
         if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
         self._swap(**{name: value})
-        super().__setattr__(name, getattr(self.psf_model, name))
+        self._take(name)
+
+    def _take(self, name: str) -> None:
+        """Make a part of the PSF model a part of this camera."""
+        part = getattr(self.psf_model, name)
+        if name != "aperture" or isinstance(part, nn.Module):
+            super().__setattr__(name, part)
+        else:
+            self._modules.pop(name, None)  # an aperture that is not learnt is the PSF model's alone
 
     def _swap(self, **parts: Any) -> None:
         self.psf_model = self.psf_model.replace(**parts)
@@ -135,65 +143,24 @@ class CameraState(nn.Module):
         self.psf_model = self.psf_model.with_window(None)
         return self.psf_model.fitted.side
 
-    @overload
     def psf_bank(
         self,
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[False] = False,
-    ) -> PSFBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[True],
-    ) -> StateBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[False] = False,
-        field: Sequence[tuple[float, float]],
-    ) -> FieldBank: ...
-
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: bool = False,
-        field: Sequence[tuple[float, float]] | None = None,
-    ) -> PSFBank | StateBank | FieldBank:
-        """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
-
-        They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
-        Without gradients, PSFs are remembered while masks and camera stay as they are.
-
-        Args:
-            channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
-            dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
-            defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
-            states: return the PSFs of each state that the modulator shows, with their weights, not the average.
-            field: points (y, x) in sensor pixels from the axis, of cameras with a lens: (F, D, C, P, P). Default: the
-                axis.
-        """
-        if field is not None:
-            points = check_field(field, self.psf_model.lens, states=states)
-            return self.psf_model.psf_bank(channels, dtype, defocus, field=points)
-        if states:
-            return self.psf_model.psf_bank(channels, dtype, defocus, states=True)
+    ) -> PSFBank:
+        """Return the PSFs of the masks as they are now. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
         return self.psf_model.psf_bank(channels, dtype, defocus)
+
+    def field_bank(
+        self,
+        field: Sequence[tuple[float, float]],
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+    ) -> FieldBank:
+        """Return PSFs at points of the field. See :meth:`kornia_tidy.psf.psf_model.PSFModel.field_bank`."""
+        return self.psf_model.field_bank(field, channels, dtype, defocus)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""

@@ -84,7 +84,7 @@ def moving_capture(
                     f"{scenes.shape[1]}"
                 )
         total, clamped = torch.zeros(()), 0
-        for moment, share in enumerate(durations):
+        for moment, share in enumerate(durations * optics.psf_model.relative_light(dtype)):
             sample = read_sample(images[:, moment], depths[:, moment], optics)
             light = optics.through_moment(moment).irradiance(sample) * share
             total = light if moment == 0 else total + light

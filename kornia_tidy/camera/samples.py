@@ -245,7 +245,7 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
     if camera.check_inputs and pixels and camera.psf_model.lens is not None:
         said = (
             "the whole picture is rendered through the PSFs of the lens's axis, which differ from those of the field: "
-            "psf_bank(field=...) shows by how much"
+            "field_bank([...]) shows by how much"
         )
         tell_once(camera.notes.told, "field", said, stacklevel=6)
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):

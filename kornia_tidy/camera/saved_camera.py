@@ -54,6 +54,8 @@ def camera_of_state(state: Mapping[str, Tensor]) -> TiDyOptics:
     if not isinstance(window, int) or 36 * window**2 > MOST_PSFS:  # three colours at three depths
         raise ValueError(f"PSFs of the camera's state must take at most {MOST_PSFS >> 20} MiB, got window {window}")
     parts["fidelity"] = parts["fidelity"].replace(window=window)  # so that it need not be measured
+    if (amplitude := state.get("aperture.amplitude")) is not None:
+        parts["aperture"] = nn.Parameter(amplitude.detach().clone().clamp(0, 1))
     paper = parts["fidelity"].propagation == "paper"
     with torch.random.fork_rng(devices=[]):
         camera = TiDyOptics(masks_of_state(state), color_space="paper" if paper else "srgb", **parts)

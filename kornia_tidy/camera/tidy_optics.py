@@ -31,6 +31,7 @@ from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
+from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
@@ -74,7 +75,8 @@ class TiDyOptics(CameraState):
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
             has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the pixels whose centres
-            lie in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`.
+            lie in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`. An ``nn.Parameter``, (N, N)
+            or one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
         check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
             unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
@@ -140,7 +142,7 @@ class TiDyOptics(CameraState):
         color_space: str | None = None,
         border: str = "reflect",
         spectrum: Spectrum | None = None,
-        aperture: Tensor | None = None,
+        aperture: Tensor | LearnableAperture | None = None,
         check_inputs: bool = True,
         memory_budget: int = 512 << 20,
         holes: str = "error",

@@ -222,7 +222,7 @@ def _column_header(figure: Figure, x: float, defocus: float, camera: ThinLensCam
 
 def _mask(figure: Figure, x: float, y: float, optics: TiDyOptics, k: int) -> None:
     phase = central_square(optics.masks.phase)[k].detach().cpu().remainder(2 * math.pi)
-    amplitude = optics.pupil.amplitude.detach().cpu()
+    amplitude = optics.pupil.transmission
     cells = amplitude.shape[-1] // phase.shape[-1]
     light = torch.nn.functional.avg_pool2d(amplitude[None, None].double(), cells)[0, 0]
     axes = _axes(figure, x, y, CELL)

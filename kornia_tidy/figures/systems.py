@@ -179,7 +179,7 @@ def _words(figure: Figure, y: float, portrait: Portrait) -> None:
 
 def _mask(figure: Figure, y: float, optics: TiDyOptics) -> None:
     phase = central_square(optics.masks.phase).detach().cpu().remainder(2 * math.pi)
-    amplitude = optics.pupil.amplitude.detach().cpu()
+    amplitude = optics.pupil.transmission
     light = torch.nn.functional.avg_pool2d(amplitude[None, None].double(), amplitude.shape[-1] // phase.shape[-1])
     shown = phase.where(light[0] > 0, math.nan)
     step = 0.0 if len(shown) == 1 else 0.3 / (len(shown) - 1)  # several masks are drawn as a stack

@@ -39,10 +39,24 @@ def limited_phase(free: Tensor, constraint: str, max_phase: float) -> Tensor:
         tensor([2., 0., 1., 1.])
     """
     if constraint == "clamp":
-        return _Clamp.apply(free + max_phase / 2, max_phase)
+        return clamped(free + max_phase / 2, max_phase)
     if constraint == "sigmoid":
         return max_phase * torch.sigmoid(free * (4 / max_phase))
     return free.remainder(max_phase) if constraint == "wrapped" else free
+
+
+def clamped(value: Tensor, limit: float) -> Tensor:
+    """Return values clamped to [0, limit], with a gradient beyond the limits only where descent leads back.
+
+    Args:
+        value: of any shape.
+        limit: in its unit.
+
+    Example:
+        >>> clamped(torch.tensor([-1.0, 0.5, 3.0]), 2.0)
+        tensor([0.0000, 0.5000, 2.0000])
+    """
+    return _Clamp.apply(value, limit)
 
 
 def unlimited_phase(phase: Tensor, constraint: str, max_phase: float) -> Tensor:

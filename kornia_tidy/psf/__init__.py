@@ -7,19 +7,19 @@ propagations.
 
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.field_bank import FieldBank
+from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.paper import AliasingWarning, paper_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.psf.state_bank import StateBank
 
 __all__ = [
     "AliasingWarning",
     "FieldBank",
+    "LearnableAperture",
     "PSFBank",
     "PSFModel",
     "Pupil",
-    "StateBank",
     "exact_psf_bank",
     "paper_psf_bank",
 ]

@@ -10,6 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from kornia_tidy.checks import check_metres
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.energies import energy_matrices, intensity_energies, pixel_energies
 from kornia_tidy.psf.propagation import sensor_kernels
@@ -20,6 +21,7 @@ from kornia_tidy.runtime.precision import has_float64
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
+_STEPS = (1e-15, 1e-4)  # m; the PSF of one pixel of the largest takes a tenth of a second
 _MOST_BYTES = 256 * 2**20
 
 
@@ -74,8 +76,8 @@ def exact_psf_bank(
         spectrum: wavelengths and how the channels weight them.
         dispersion: for each wavelength, the factor from phase at 530 nm to phase there.
         defocus: nodes in radians at 530 nm, ascending.
-        pixel_step: a sensor pixel in the pupil, pitch * R / image distance, in metres; divided by a wavelength it is
-            the pixel's side in cycles per pupil radius. May carry gradients.
+        pixel_step: a sensor pixel in the pupil, pitch * R / image distance, in metres, at most 1e-4; divided by a
+            wavelength it is the pixel's side in cycles per pupil radius. May carry gradients.
         window: side P of the PSFs in pixels, odd.
         tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
         chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
@@ -85,6 +87,9 @@ def exact_psf_bank(
 
     Returns:
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
+
+    Raises:
+        ValueError: if the step is no such length, as where it is given in cycles.
 
     Convention:
         - Where ``pupil.fill_factor`` is below 1, the gaps between the squares that modulate are integrated as exactly:
@@ -99,6 +104,9 @@ def exact_psf_bank(
         >>> bank.psfs.shape
         torch.Size([1, 1, 23, 23])
     """
+    if not torch_mode():
+        step = float(pixel_step.detach()) if isinstance(pixel_step, Tensor) else pixel_step
+        check_metres("pixel_step", step, *_STEPS, "pitch * R / image distance, such as 2.1e-7; cycles times wavelength")
     per_channel = spectrum.plane_weights
     cells = pupil.amplitude.shape[-1]
     gaps = None if pupil.fill_factor == 1 else (cells // phase.shape[-1], pupil.fill_factor)
@@ -124,7 +132,8 @@ def exact_psf_bank(
 
             left, pixels = _matrix_memory.recall([(psi, constants) for psi in defocus], matrices_of)
             lens = pupil, tuple(dispersion), per_channel
-            scales, amplitude, share = _constants_of(*lens, phase.device, phase.dtype)
+            make = _constants_of.__wrapped__ if pupil.amplitude.requires_grad else _constants_of
+            scales, amplitude, share = make(*lens, phase.device, phase.dtype)
             nodes = _nodes_of(tuple(defocus), phase.device, phase.dtype)
             waves = field(phase, amplitude, scales)
             if each_state:  # in the place of more wavelengths
@@ -135,9 +144,9 @@ def exact_psf_bank(
             psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
             return PSFBank(psfs, nodes, psfs.sum((2, 3)))
     if each_state:
-        rest = pupil, spectrum, dispersion, defocus, pixel_step, window, tolerance, chromatic_defocus
-        one = torch.ones_like(weights[:1])
-        banks = [exact_psf_bank(own[None], one, *rest, remember=remember) for own in phase]
+        rest = spectrum, dispersion, defocus, pixel_step, window, tolerance, chromatic_defocus
+        one, masks = torch.ones_like(weights[:1]), [slice(k, k + 1) for k in range(len(phase))]
+        banks = [exact_psf_bank(phase[k], one, pupil.of_masks(k), *rest, remember=remember) for k in masks]
         psfs, energies = (torch.cat(own, 1) for own in zip(*((b.psfs, b.energy) for b in banks), strict=True))
         return PSFBank(psfs, banks[0].defocus, energies)
 

@@ -38,7 +38,7 @@ class FieldBank:
     Example:
         >>> from kornia_tidy.psf import PSFModel
         >>> model = PSFModel(lens="single-50mm", fidelity="draft")
-        >>> bank = model.psf_bank(defocus=[0.0], field=[(0.0, 0.0), (550.0, 630.0)])
+        >>> bank = model.field_bank([(0.0, 0.0), (550.0, 630.0)], defocus=[0.0])
         >>> bank.psfs.shape[:3], round(float(bank.light[1, 0, 1]), 2)
         (torch.Size([2, 1, 3]), 0.97)
     """
@@ -84,14 +84,12 @@ class FieldBank:
 
 
 @on_cpu
-def check_field(field: Sequence[tuple[float, float]], lens: Lens | None, *, states: bool) -> list[tuple[float, float]]:
+def check_field(field: Sequence[tuple[float, float]], lens: Lens | None) -> list[tuple[float, float]]:
     """Return points of the field, or raise ``ValueError`` or ``TypeError`` if they are none or there is no lens."""
     if lens is None:
         raise ValueError(
             "field points need a camera with a lens, got none: give it lens='double-gauss-50mm' or another"
         )
-    if states:
-        raise ValueError("PSFs at field points are averaged over the exposure, got states=True: leave one of them out")
     try:
         points = torch.as_tensor(field, dtype=torch.float64)
     except (TypeError, ValueError):

@@ -53,7 +53,7 @@ def paper_psfs(
     Args:
         phase: radians at 530 nm, (K, 23, 23).
         weights: share of the exposure of each mask, (K,).
-        aperture: amplitude, (23, 23).
+        aperture: amplitude, (23, 23), or one for each mask, (K, 23, 23), all of one light.
         defocus: radians at the pupil edge at 530 nm, (D,).
         wavelength: in metres.
         dispersion: factor that takes the phase at 530 nm to this wavelength (for n = 1.5, 530 nm / wavelength).
@@ -82,7 +82,8 @@ def paper_psfs(
     wave = wave[..., margin : margin + PAPER_SIZE, margin : margin + PAPER_SIZE]
     intensity = wave.real.square() + wave.imag.square()
     mean = (weights.to(intensity)[:, None, None] * intensity).sum(1)  # no matrix product: GPUs may round those to TF32
-    return mean / (pad**2 * amplitude.square().sum())
+    light = amplitude.square().sum() if amplitude.ndim == 2 else amplitude[0].square().sum()
+    return mean / (pad**2 * light)
 
 
 def paper_psf_bank(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor
-from typing import Any, Literal, NoReturn, Self, cast, overload
+from typing import Any, NoReturn, Self, cast
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from kornia_tidy.psf.defocus_interpolation import (
 )
 from kornia_tidy.psf.field_bank import FieldBank, check_field, field_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius
+from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -39,12 +40,10 @@ from kornia_tidy.psf.psf_ops import computed_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
-from kornia_tidy.psf.state_bank import StateBank
 from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
-EACH = -1  # in the place of a state: all of them, each for itself, in one bank
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
@@ -72,7 +71,8 @@ class PSFModel:
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
-            Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``.
+            Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``. An ``nn.Parameter``,
+            (N, N) or one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
         lens: a :class:`~kornia_tidy.optics.Lens` whose stop the masks stand in, or the name of one, made for the
             camera's aperture and focus. Its stop and its rims cut the masks exactly, besides ``aperture``. Default: an
             ideal lens.
@@ -80,7 +80,7 @@ class PSFModel:
     Raises:
         TypeError: if a part is of another type.
         ValueError: if the lens is not that of the camera, the camera's defocus needs more than 4096 layers or PSFs
-            eight times as wide as the largest window, or a mask holds NaN.
+            eight times as wide as the largest window, a mask holds NaN, or parts do not fit a learnable aperture.
 
     Example:
         >>> model = PSFModel()
@@ -93,7 +93,7 @@ class PSFModel:
     modulator: nn.Module
     fidelity: Fidelity
     spectrum: Spectrum
-    aperture: Tensor | None
+    aperture: Tensor | LearnableAperture | None
     lens: Lens | None
     measured: PSFBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
@@ -113,7 +113,7 @@ class PSFModel:
         modulator: nn.Module | None = None,
         fidelity: str | Fidelity = "balanced",
         spectrum: Spectrum | None = None,
-        aperture: Tensor | None = None,
+        aperture: Tensor | LearnableAperture | None = None,
         lens: Lens | str | None = None,
     ) -> None:
         vars(self).update(measured=None, state=None, moment=None, measured_cut=False, _memories={})
@@ -160,7 +160,9 @@ class PSFModel:
                 check_part(name, value, *PARTS[name])
         if "aperture" in parts:
             parts["_aperture_mark"] = object()
-        if (aperture := parts.get("aperture")) is not None:
+        if isinstance(aperture := parts.get("aperture"), nn.Parameter):
+            parts["aperture"] = LearnableAperture(aperture)
+        elif aperture is not None and not isinstance(aperture, LearnableAperture):
             check_part("aperture", aperture, (Tensor, np.ndarray), "a tensor of amplitudes (N, N) such as 23x23")
             parts["aperture"] = check_aperture(aperture, aperture.shape[-1])
         if "spectrum" in parts or "fidelity" in parts:
@@ -171,6 +173,8 @@ class PSFModel:
         if present["lens"] is not None:
             given = (present[name] for name in ("lens", "camera", "fidelity", "_sampled"))
             parts["lens"] = fitting_lens(*given)
+            if isinstance(present["aperture"], (nn.Parameter, LearnableAperture)):
+                raise ValueError("a learnable aperture needs an ideal lens, got a lens with a stop of its own")
         return self._replace(_derived=Derived(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
@@ -181,84 +185,55 @@ class PSFModel:
 
     # ------------------------------------------------------------------ PSFs
 
-    @overload
     def psf_bank(
         self,
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[False] = False,
-    ) -> PSFBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[True],
-    ) -> StateBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: Literal[False] = False,
-        field: Sequence[tuple[float, float]],
-    ) -> FieldBank: ...
-
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        states: bool = False,
-        field: Sequence[tuple[float, float]] | None = None,
-    ) -> PSFBank | StateBank | FieldBank:
+    ) -> PSFBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
         Without gradients, PSFs are remembered while masks and camera stay as they are. Measured PSFs are mixed linearly
-        between their nodes, as a capture mixes them.
+        between their nodes, as a capture mixes them. Those of one state: ``through_state(k).psf_bank()``.
 
         Args:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
-            states: return the PSFs of each state that the modulator shows, with their weights, not the average.
-            field: points (y, x) in sensor pixels from the axis, of cameras with a lens. Default: the axis.
         """
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = self.bank_dtype(dtype)
-        if field is not None:
-            return self._field_bank(spectrum.flat(), dtype, defocus, check_field(field, self.lens, states=states))
         if self.measured is not None:
-            if states:
-                raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
-        nodes, stray_light = self.defocus_nodes if defocus is None else tuple(defocus), self.fidelity.stray_light
-        if not states:
-            return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(stray_light)
-        weights = self.state_weights(dtype)
-        banks = [self._computed_bank(spectrum.flat(), dtype, nodes, state) for state in range(len(weights))]
-        return StateBank.of([bank.with_stray_light(stray_light) for bank in banks], weights)
+        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+        return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
 
-    def _field_bank(
+    def field_bank(
         self,
-        spectrum: Spectrum,
-        dtype: torch.dtype,
-        defocus: Sequence[float] | None,
         field: Sequence[tuple[float, float]],
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
     ) -> FieldBank:
+        """Return the PSFs of :meth:`psf_bank` at points of the field, of a camera with a lens: (F, D, C, P, P).
+
+        Args:
+            field: points (y, x) in sensor pixels from the axis.
+            channels: as there.
+            dtype: as there.
+            defocus: as there.
+
+        Raises:
+            TypeError: if the field is not numbers.
+            ValueError: if there is no lens, or the field is not one or more finite points.
+        """
+        points = check_field(field, self.lens)
+        spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels).flat()
         nodes, tolerance = self.defocus_nodes if defocus is None else tuple(defocus), self.fidelity.pixel_tolerance
-        bank = self._lens_psfs(spectrum, *self.states(dtype), nodes, self.window, field, tolerance)
+        shown = self.states(self.bank_dtype(dtype))
+        bank = self._lens_psfs(spectrum, *shown, nodes, self.window, points, tolerance)
         return bank.with_stray_light(self.fidelity.stray_light)
 
     def _lens_psfs(
@@ -285,7 +260,8 @@ class PSFModel:
         channels: int,
         dtype: torch.dtype,
         defocus: Tensor,
-        state: int | None = None,
+        *,
+        each_state: bool = False,
         device: torch.device | None = None,
     ) -> PSFBank:
         """Return the PSFs that a scene needs; of depths it does not hold there are none.
@@ -297,8 +273,7 @@ class PSFModel:
             channels: of the image: those of the spectrum, or 1.
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
-            state: index among the states of the exposure, or :data:`EACH` for all of them in one bank,
-                (D, S C, P, P). Default: their average.
+            each_state: the PSFs of each state of the exposure in one bank, (D, S C, P, P), and not their average.
             device: of measured PSFs. Default: that of ``defocus``.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
@@ -307,13 +282,13 @@ class PSFModel:
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         if kind in ("nearest", "linear"):
-            return self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), state, stray_light)
+            return self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), each_state, stray_light)
         targets = nodes_around(fine_nodes(nodes), defocus)
         spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
         first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
         last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
         samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
-        bank = self._computed_bank(spectrum, dtype, samples, state)
+        bank = self._computed_bank(spectrum, dtype, samples, each_state)
         band = self._band() if kind == "bandlimited" else None
         return interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
 
@@ -338,47 +313,48 @@ class PSFModel:
         spectrum: Spectrum,
         dtype: torch.dtype,
         nodes: tuple[float, ...],
-        state: int | None = None,
+        each_state: bool = False,
         stray_light: tuple[str, int] | None = None,
         group: BlurGroup | None = None,
     ) -> PSFBank:
         """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
         states, weights = self.states(dtype)
-        if state is not None and state != EACH:
-            states, weights = states[state : state + 1], torch.ones_like(weights[:1])
         traced = torch_mode() & Mode.TRACED
         side, grid = self.window if traced else self.fitted.side, 1  # the light in it is measured at the first PSFs
         if group is not None:
             side, grid = group.window, group.grid
-        learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        exact = partial(self._exact_psfs, spectrum, grid)
-        build = partial(exact, states, weights, window=side, each_state=state == EACH)
-        if (blur := self.wide_blur) is not None and not traced and state != EACH:
+        pupil, learning = self._shown_pupil, torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
+        learning = learning or pupil.amplitude.requires_grad
+        exact = partial(self._exact_psfs, spectrum, grid, pupil)
+        build = partial(exact, states, weights, window=side, each_state=each_state)
+        if (blur := self.wide_blur) is not None and not traced and not each_state:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
                 with torch.no_grad():
-                    bank = self._computed_bank(spectrum, dtype, nodes, state, None, group)
+                    bank = self._computed_bank(spectrum, dtype, nodes, group=group)
                 bank = learnt_bank(bank, exact, states, weights, grid)
                 return bank if stray_light is None else bank.with_stray_light(*stray_light)
             shares = [sum(row) for row in spectrum.plane_weights]
-            lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
+            lens = blur, pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
         memories, unread = self._memories, Mode.UNREAD in torch_mode()
         if memories is None or learning or traced or unread or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
-        fill_factor = getattr(self.modulator, "fill_factor", 1.0)
-        setting = [side, self.fidelity, self._aperture_mark, fill_factor]
+        setting = [side, self.fidelity, self._aperture_mark, pupil.fill_factor]
         setting += [None if self.lens is None else self.lens.table]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, state if self.state is None else self.state, torch.get_num_threads(), grid
+        key = self.moment, self.state, torch.get_num_threads(), grid
         memory = memories.get(key) or memories.setdefault(key, BankMemory())
+        if isinstance(self.aperture, LearnableAperture):
+            weights = torch.cat([weights, pupil.amplitude.to(weights).flatten()])  # compared by value as well
         return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
 
     def _exact_psfs(
         self,
         spectrum: Spectrum,
         grid: int,
+        pupil: Pupil,
         states: Tensor,
         weights: Tensor,
         nodes: tuple[float, ...],
@@ -389,11 +365,12 @@ class PSFModel:
     ) -> PSFBank:
         if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
             check_finite("the phase of the masks", states)
+            if isinstance(self.aperture, LearnableAperture):
+                check_open(pupil.amplitude)
             check_finite("the weights of the modulator", weights)
         # How the phase of the masks and the focus of the lens change from wavelength to wavelength.
         dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
         shift = [self.camera.chromatic_defocus(wavelength) for wavelength in spectrum.wavelengths]
-        pupil = self.pupil
         if self.lens is not None:
             points = [(0.0, 0.0)]
             shown = zip(states[:, None], torch.ones_like(weights), strict=True) if each_state else [(states, weights)]
@@ -426,12 +403,17 @@ class PSFModel:
     # ------------------------------------------------------------------ the exposure
 
     def states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Return the phase of each state over the pupil, (S, N, N) radians, and its share of the exposure, (S,)."""
+        """Return the phase of each state over the pupil, (S, N, N) radians, and its share of the exposure, (S,).
+
+        Where each mask has an amplitude of its own the share is that of the light.
+        """
         shown = timeline_of(self.modulator, self.masks.phase.to(dtype))
         if self.moment is not None:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
+            if isinstance(self.aperture, LearnableAperture):
+                weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
         return (states if states.shape[-1] == states.shape[-2] else central_square(states)), weights
@@ -439,6 +421,23 @@ class PSFModel:
     def timeline(self, dtype: torch.dtype) -> Timeline:
         """Return what the modulator shows of the masks during one exposure, and when."""
         return timeline_of(self.modulator, self.masks.phase.to(dtype))
+
+    def relative_light(self, dtype: torch.dtype) -> Tensor:
+        """Return the light that passes at each moment over that of the whole exposure, (M,): 1 of one aperture.
+
+        Raises:
+            ValueError: if each mask has an amplitude of its own, and the modulator shows other states than the masks.
+        """
+        shown = self.timeline(dtype)
+        if not isinstance(self.aperture, LearnableAperture) or self.aperture.amplitude.ndim == 2:
+            return torch.ones_like(shown.durations)
+        light = self.aperture().square().sum((-2, -1)).to(shown.durations)
+        if shown.mixture is not None or len(shown.states) != len(light):
+            raise ValueError(
+                f"an aperture for each mask needs a modulator that shows the {len(light)} masks one by one, such as "
+                f"DwellTimes(), got {len(shown.states)} states: give one aperture (N, N) for all"
+            )
+        return light / (shown.durations * light).sum()
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
@@ -470,18 +469,23 @@ class PSFModel:
             state: index among the states that the modulator shows.
 
         Raises:
-            ValueError: if there is no such state.
+            ValueError: if there is no such state, or PSFs were measured, which are those of the whole exposure.
 
         Example:
             >>> model = PSFModel()
-            >>> one, every = model.through_state(2).psf_bank(defocus=[0.0]), model.psf_bank(defocus=[0.0], states=True)
-            >>> torch.equal(one.psfs, every.psfs[2])
-            True
+            >>> len(model.state_weights(torch.float32)), len(model.through_state(2).state_weights(torch.float32))
+            (5, 1)
         """
+        if self.measured is not None:
+            raise ValueError("PSFs that were measured are known for the whole exposure, not for each state of it")
         count = len(self.state_weights(torch.float32))
         if not 0 <= state < count:
             raise ValueError(f"state must be from 0 to {count - 1}, got {state}")
-        return self._replace(state=state, _derived=Derived(self.fitted))
+        return self.of_state(state)._replace(_derived=Derived(self.fitted))
+
+    def of_state(self, state: int) -> Self:
+        """Return this model with one state, unchecked, and what was found for all of them, such as wide blur."""
+        return self._replace(state=state if self.state is None else self.state)
 
     def through_moment(self, moment: int) -> Self:
         """Return this model with what its modulator shows at one moment shown all the time: one state, or some at once.
@@ -618,8 +622,8 @@ class PSFModel:
         """
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        states = self.states(torch.float32)
-        psfs = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, size, tolerance=_SAMPLING).psfs
+        shown = self._shown_pupil, *self.states(torch.float32)
+        psfs = self._exact_psfs(self._sampled.flat(), 1, *shown, nodes, size, tolerance=_SAMPLING).psfs
         return psfs if self.fidelity.propagation == "paper" else psfs / self.pupil.field_share
 
     def _check_layers(self) -> None:
@@ -631,10 +635,18 @@ class PSFModel:
         fill_factor, pupil = getattr(self.modulator, "fill_factor", 1.0), self._derived.pupil
         if pupil is None or pupil.fill_factor != fill_factor:
             aperture = getattr(self.masks, "iris", None) if self.aperture is None else self.aperture
-            if self.lens is not None and self.aperture is None:  # its stop is the edge
+            if isinstance(aperture, LearnableAperture):  # any pixel may open
+                aperture = torch.ones(aperture.amplitude.shape[-2:])
+            elif self.lens is not None and self.aperture is None:  # its stop is the edge
                 aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
-        return pupil
+        return pupil.with_learnt(self.aperture()) if isinstance(self.aperture, LearnableAperture) else pupil
+
+    @property
+    def _shown_pupil(self) -> Pupil:
+        """The pupil of the states that are looked through."""
+        shown = self.state if self.moment is None else self.moment
+        return self.pupil if shown is None else self.pupil.of_masks(slice(shown, shown + 1))
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
@@ -681,6 +693,8 @@ class PSFModel:
         camera, known, step = self.camera, self._derived.window, self.pixel_step
         if self.measured is not None or self.lens is not None or self.spectrum.basis is not None:
             return None
+        if isinstance(self.aperture, LearnableAperture):
+            return None
         if not self.fidelity.blurs_by_rays:
             return None
         # A focus that is learnt moves the PSFs' sampling; colours with focuses of their own have discs of their own.
@@ -700,7 +714,7 @@ class PSFModel:
         for radius in (0.0, 2.0, SMALLEST_WIDE_RADIUS):
             nodes = (radius * math.pi * step / REFERENCE_WAVELENGTH,)
             side = window_of(radius, step, self.pupil.extent)
-            bank = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, side, tolerance=_SAMPLING)
+            bank = self._exact_psfs(self._sampled.flat(), 1, self.pupil, *states, nodes, side, tolerance=_SAMPLING)
             shares.append(bank.energy)
         return float(torch.cat(shares).min()), float(torch.cat(shares).max())
 

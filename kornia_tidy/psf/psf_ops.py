@@ -51,7 +51,7 @@ def computed_psf_bank(
 ) -> PSFBank:
     """Return the bank of :func:`kornia_tidy.psf.exact.exact_psf_bank`, by the operator while compiling.
 
-    A sensor pixel with a gradient and the PSFs of each state are compiled as plain operations.
+    A sensor pixel with a gradient, an aperture that is learnt and PSFs of each state are compiled as plain operations.
 
     Args:
         phase: as there, as all others.
@@ -74,7 +74,8 @@ def computed_psf_bank(
         torch.Size([1, 1, 23, 23])
     """
     lens = pupil, spectrum, dispersion, defocus
-    if torch_mode() == Mode.GRAPH and not (isinstance(pixel_step, Tensor) or each_state):
+    learnt = isinstance(pixel_step, Tensor) or pupil.amplitude.requires_grad or pupil.amplitude.ndim == 3
+    if torch_mode() == Mode.GRAPH and not (learnt or each_state):
         return operator_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus)
     lens = *lens, pixel_step, window, tolerance, chromatic_defocus
     return exact_psf_bank(phase, weights, *lens, each_state, remember)

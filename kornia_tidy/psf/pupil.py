@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,8 @@ class Pupil:
     """The aperture on a grid of square cells, a whole number of them for each mask pixel.
 
     Args:
-        amplitude: (n, n) in [0, 1], or an :class:`~kornia_tidy.optics.aperture.OpenArea`.
+        amplitude: (n, n) in [0, 1], or an :class:`~kornia_tidy.optics.aperture.OpenArea`. Of a learnable aperture
+            (n, n) or one for each mask, (K, n, n), scaled to let a light of one through.
         cell_pitch: side of a cell in pupil radii.
         fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
         light: that it lets through, in units of squared amplitude times pupil radii squared. Default: the open area of
@@ -60,6 +62,26 @@ class Pupil:
     def field_share(self) -> float:
         """Share of the light in the field of the cells: 1, and less where cells at a hard edge hold its mean only."""
         return min(1.0, float(self.amplitude.double().square().sum()) * self.cell_pitch**2 / self.light)
+
+    def with_learnt(self, amplitude: Tensor) -> Pupil:
+        """Return this pupil with amplitudes that are learnt: of one light each, and sampled where this pupil is open.
+
+        Args:
+            amplitude: (n, n), or (K, n, n) for K masks.
+        """
+        pupil, light = copy.copy(self), amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
+        shared = amplitude.detach().double().square()
+        transmission = (shared if shared.ndim == 2 else shared.mean(0)).cpu()
+        vars(pupil).update(amplitude=amplitude / light.sqrt(), transmission=transmission, light=1.0)
+        return pupil
+
+    def of_masks(self, masks: slice) -> Pupil:
+        """Return the pupil of some of the masks: itself, unless each has an amplitude of its own."""
+        if self.amplitude.ndim == 2:
+            return self
+        pupil = copy.copy(self)
+        vars(pupil).update(amplitude=self.amplitude[masks])
+        return pupil
 
     def __post_init__(self) -> None:
         size = self.amplitude.shape[-1]
@@ -102,7 +124,8 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> 
 
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.
-        aperture: amplitude on the same grid or one with a whole number of cells for each mask pixel, (sN, sN).
+        aperture: amplitude on the same grid or one with a whole number of cells for each mask pixel, (sN, sN), or one
+            for each mask, (K, sN, sN).
         dispersion: factor that takes the phase at 530 nm to the wavelength, or such factors, (W, 1, 1, 1).
 
     Returns:

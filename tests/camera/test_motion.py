@@ -8,8 +8,18 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNoise, Switching, TiDyOptics
+from kornia_tidy import (
+    DefocusRange,
+    DwellTimes,
+    Fidelity,
+    LearnableDwellTimes,
+    PixelwiseMask,
+    SensorNoise,
+    Switching,
+    TiDyOptics,
+)
 from kornia_tidy.camera.motion import moving_capture, scenes_by_flow, scenes_by_homography, state_times
+from kornia_tidy.masks.base import metres_to_radians
 from kornia_tidy.modulator.modulator import SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.psf.psf_model import PSFModel
@@ -189,13 +199,33 @@ class TestMovingCapture(BaseTester):
 class TestThroughState(BaseTester):
     def test_feature_it_is_that_state_alone(self):
         optics = camera(modulator=Switching(8e-3, between="linear", samples=2))
-        every = optics.psf_bank(states=True)
+        phases = optics.psf_model.states(torch.float32)[0].detach()
         for state in (0, 2, 3, 6):
             one = optics.through_state(state)
-            self.assert_close(one.psf_bank().psfs, every.psfs[state])
-            self.assert_close(one.psf_bank(states=True).psfs[0], every.psfs[state])
+            masks = PixelwiseMask(initial=phases[state, None] / metres_to_radians(optics.masks.material))
+            alone = TiDyOptics(masks, optics.camera, fidelity=SMALL)
+            self.assert_close(one.psf_bank().psfs, alone.psf_bank().psfs, rtol=1e-4, atol=1e-8)
+            self.assert_close(one.through_state(0).psf_bank().psfs, one.psf_bank().psfs)
             assert one.state_weights(torch.float32).tolist() == [1.0]
             assert one.window == optics.window
+
+    def test_feature_the_weighted_mean_of_the_states_is_the_bank(self):
+        for fidelity in (SMALL, Fidelity.preset("paper")):
+            optics = TiDyOptics(PixelwiseMask(3), DefocusRange(-10, 10), DwellTimes((1, 2, 5)), fidelity=fidelity)
+            mean = sum(w / 8 * optics.through_state(k).psf_bank().psfs for k, w in enumerate((1, 2, 5)))
+            self.assert_close(mean, optics.psf_bank().psfs, rtol=1e-5, atol=1e-8)
+
+    def test_feature_remembered_states_follow_the_masks_and_send_gradients_to_their_own(self):
+        optics = camera()
+        with torch.no_grad():
+            first = [optics.through_state(k).psf_bank().psfs for k in range(2)]
+            assert torch.equal(optics.through_state(1).psf_bank().psfs, first[1])
+            optics.masks.phase[1] += torch.rand(23, 23)
+            second = [optics.through_state(k).psf_bank().psfs for k in range(2)]
+        assert torch.equal(second[0], first[0])
+        assert not torch.allclose(second[1], first[1])
+        optics.through_state(1).psf_bank().psfs.square().sum().backward()
+        assert [bool(gradient.any()) for gradient in optics.masks.phase.grad] == [False, True, False]
 
     def test_exception(self):
         for state in (-1, 3):

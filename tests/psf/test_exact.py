@@ -48,6 +48,15 @@ def by_quadrature(phase: np.ndarray, psi: float, wavelength: float, window: int,
     return intensity.reshape(window, 12, window, 12).sum((1, 3))
 
 
+class TestPixelStep(BaseTester):
+    @pytest.mark.parametrize("step", [0.4, torch.tensor(0.4), 1.1e-4, 0.0, -2e-7, float("nan"), float("inf"), 1e-16])
+    def test_exception_other_units(self, step):
+        """A step in cycles took days."""
+        lens = Pupil(torch.ones(23, 23), 0.1), Spectrum.monochrome(), [1.0], [0.0]
+        with pytest.raises(ValueError, match=rf"pixel_step must be .*metres.* got {float(step):.3}"):
+            exact_psf_bank(torch.zeros(1, 23, 23), torch.ones(1), *lens, step, 5)
+
+
 LIMITS = {"draft": 3e-2, "balanced": 1e-3, "reference": 1e-6}
 
 

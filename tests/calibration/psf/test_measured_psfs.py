@@ -278,4 +278,4 @@ class TestMeasuredPSFs(BaseTester):
         with pytest.raises(ValueError, match="the measured PSFs have 3 channels, not 1"):
             optics(torch.rand(1, 48, 48), torch.ones(1, 48, 48))
         with pytest.raises(ValueError, match="known for the whole exposure"):
-            optics.psf_bank(states=True)
+            optics.through_state(0)

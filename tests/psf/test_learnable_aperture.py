@@ -1,0 +1,253 @@
+"""Apertures that are learnt: a parameter of the camera, and the same physics as an aperture that is given."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Switching, TiDyOptics
+from kornia_tidy.camera.burst import burst
+from kornia_tidy.camera.motion import moving_capture
+from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.psf import LearnableAperture
+from tests.base import BaseTester
+
+SMALL = Fidelity(window=9, layer_spacing=10.0)
+EXACT = Fidelity(window=5, layer_spacing=20.0, double=True)
+
+
+def apertures(count: int = 3, size: int = 23, dtype: torch.dtype = torch.float32) -> nn.Parameter:
+    drawn = torch.rand(count, size, size, generator=torch.Generator().manual_seed(4), dtype=dtype)
+    return nn.Parameter(0.2 + 0.6 * drawn)
+
+
+def camera(aperture, masks=3, **options) -> TiDyOptics:
+    torch.manual_seed(1)
+    options = {"fidelity": SMALL, "sensor": None, "color_space": "linear", **options}
+    return TiDyOptics(PixelwiseMask(masks), aperture=aperture, **options)
+
+
+def scene(dtype=torch.float32):
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(1, 3, 24, 26, generator=generator, dtype=dtype)
+    return image, 0.3 + torch.rand(1, 1, 24, 26, generator=generator, dtype=dtype)
+
+
+class TestLearnableAperture(BaseTester):
+    def test_smoke(self):
+        aperture = LearnableAperture(nn.Parameter(apertures(1)[0]))
+        assert aperture().shape == (23, 23)
+        assert "23x23" in repr(aperture)
+        assert "each of 3 masks" in repr(LearnableAperture(apertures()))
+
+    @pytest.mark.parametrize(
+        ("aperture", "error", "words"),
+        [
+            (torch.ones(23, 23), TypeError, "must be an nn.Parameter of real floating-point numbers, got Tensor"),
+            (nn.Parameter(torch.ones(23, 23, dtype=torch.complex64)), TypeError, "got torch.complex64"),
+            (nn.Parameter(torch.ones(23, 22)), ValueError, r"must have shape \(N, N\).*got \(23, 22\)"),
+            (nn.Parameter(torch.ones(23)), ValueError, r"got \(23,\)"),
+            (nn.Parameter(torch.full((23, 23), 1.5)), ValueError, r"amplitudes in \[0, 1\], got 1.5"),
+            (nn.Parameter(torch.full((23, 23), torch.nan)), ValueError, r"amplitudes in \[0, 1\], got nan"),
+            (
+                nn.Parameter(torch.stack([torch.ones(23, 23), torch.zeros(23, 23)])),
+                ValueError,
+                "let some light through",
+            ),
+        ],
+    )
+    def test_exception(self, aperture, error, words):
+        with pytest.raises(error, match=words):
+            LearnableAperture(aperture)
+
+    def test_exception_parts_that_do_not_fit(self):
+        with pytest.raises(ValueError, match="a whole number of cells for each of the 23 mask pixels"):
+            camera(nn.Parameter(torch.ones(20, 20)))
+        with pytest.raises(ValueError, match=r"shows the 2 masks one by one, such as .*, got 3 states"):
+            camera(apertures(2))
+        with pytest.raises(ValueError, match=r"shows the 3 masks one by one, such as .*, got"):
+            camera(apertures(), modulator=Switching(8e-3))
+        lens = Lens.named("single-50mm", 17.6, 0.595)
+        with pytest.raises(ValueError, match="a learnable aperture needs an ideal lens"):
+            camera(nn.Parameter(torch.ones(23, 23)), camera=lens.camera(8e-6), lens=lens)
+
+    def test_exception_learning_that_closed_it(self):
+        optics = camera(apertures())
+        with torch.no_grad():
+            optics.aperture.amplitude[1] = -1
+        with pytest.raises(ValueError, match="aperture must let some light through"):
+            optics(*scene())
+        with torch.no_grad():
+            optics.aperture.amplitude[1] = torch.nan
+        with pytest.raises(ValueError, match="and be finite, got amplitudes up to nan"):
+            optics(*scene())
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_one_for_all_masks_is_the_given_aperture(self, compositing):
+        amplitude = apertures(1)[0].detach()
+        learnt, given = camera(nn.Parameter(amplitude), compositing=compositing), camera(amplitude)
+        given.compositing = compositing
+        self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
+        same = camera(nn.Parameter(amplitude.expand(3, 23, 23).clone()), compositing=compositing)
+        self.assert_close(same(*scene()), given(*scene()), rtol=0, atol=1e-6)
+
+    def test_feature_the_papers_fidelity(self):
+        amplitude = 0.5 * circular_aperture(23).float()
+        options = {"camera": DefocusRange(-10, 10), "fidelity": "paper", "color_space": "paper"}
+        for shape in ((23, 23), (3, 23, 23)):
+            learnt = camera(nn.Parameter(amplitude.expand(shape).clone()), **options)
+            self.assert_close(learnt.psf_bank().psfs, camera(amplitude, **options).psf_bank().psfs)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_masks_count_by_the_light_that_passes(self, compositing):
+        """The exposure is the mean of captures through each mask with its aperture, weighted by time and light."""
+        amplitude, times = apertures(), (1, 2, 1)
+        with torch.no_grad():
+            amplitude[1] *= 0.5
+        fidelity = SMALL.replace(stray_light="discard")  # each PSF scaled to one would not be their average scaled
+        optics = camera(amplitude, compositing=compositing, modulator=DwellTimes(times), fidelity=fidelity)
+        light = amplitude.detach().square().sum((1, 2)) * torch.tensor(times)
+        captures = []
+        for k, height in enumerate(optics.masks.heights().detach()):
+            alone = TiDyOptics(
+                PixelwiseMask(initial=height),
+                aperture=amplitude[k].detach(),
+                compositing=compositing,
+                sensor=None,
+                color_space="linear",
+                fidelity=fidelity,
+            )
+            captures.append(alone(*scene()))
+            self.assert_close(optics.through_state(k)(*scene()), captures[k], rtol=0, atol=2e-6)
+        expected = sum(share * capture for share, capture in zip(light / light.sum(), captures, strict=True))
+        self.assert_close(optics(*scene()), expected, rtol=0, atol=2e-6)
+        image, depth = (part[:, None].repeat(1, 3, 1, 1, 1) for part in scene())
+        self.assert_close(moving_capture(optics, image, depth), expected, rtol=0, atol=2e-6)
+        self.assert_close(burst(optics, *scene()).sum(1), expected, rtol=0, atol=2e-6)
+
+    def test_feature_gaps_between_pixels(self):
+        from kornia_tidy.modulator.modulator import SpatialLightModulator
+
+        amplitude, panel = apertures(1)[0].detach(), SpatialLightModulator(DwellTimes(), fill_factor=0.8)
+        given = camera(amplitude, modulator=panel)(*scene())
+        self.assert_close(camera(nn.Parameter(amplitude), modulator=panel)(*scene()), given, rtol=0, atol=1e-6)
+        each = nn.Parameter(amplitude.expand(3, 23, 23).clone())
+        self.assert_close(camera(each, modulator=panel)(*scene()), given, rtol=0, atol=1e-6)
+
+    def test_feature_it_is_a_parameter_of_the_camera(self):
+        amplitude = apertures()
+        optics = camera(amplitude)
+        assert dict(optics.named_parameters())["aperture.amplitude"] is amplitude
+        assert optics.aperture.amplitude is amplitude
+        masks, rest = optics.parameter_groups(1e-8, lr=1e-2)
+        assert any(p is amplitude for p in rest["params"])
+        assert not any(p is amplitude for p in masks["params"])
+        double = copy.deepcopy(optics).to(torch.float64)
+        assert double.aperture.amplitude.dtype == torch.float64
+        assert double.psf_model.aperture is double.aperture
+        assert amplitude.dtype == torch.float32
+        optics.aperture = None
+        assert not any(name.startswith("aperture") for name in optics.state_dict())
+        optics.aperture = amplitude[0].detach()
+        assert "aperture" not in dict(optics.named_children())
+        optics.aperture = nn.Parameter(amplitude[0].detach())
+        assert "aperture.amplitude" in optics.state_dict()
+        optics(*scene()).sum().backward()
+        assert optics.aperture.amplitude.grad.abs().max() > 0
+
+    def test_feature_a_copy_learns_for_itself(self):
+        optics = camera(apertures())
+        other = copy.deepcopy(optics)
+        before = optics(*scene()).detach()
+        with torch.no_grad():
+            other.aperture.amplitude.mul_(torch.rand(3, 23, 23))
+        assert torch.equal(optics(*scene()).detach(), before)
+        assert not torch.allclose(other(*scene()).detach(), before, atol=1e-4)
+
+    @pytest.mark.parametrize("shape", [(23, 23), (3, 23, 23)])
+    def test_feature_states(self, shape):
+        optics = camera(nn.Parameter(torch.rand(shape)))
+        with torch.no_grad():
+            optics.aperture.amplitude[..., 3, 3] = 1.25  # as a step may leave it
+        other = camera(nn.Parameter(torch.ones(shape)))
+        other.load_state_dict(optics.state_dict())
+        made = camera_of_state(optics.state_dict())
+        with torch.no_grad():
+            for again in (other, made):
+                assert torch.equal(again(*scene()), optics(*scene()))
+        with pytest.raises(ValueError, match="the state is that of another camera: aperture is a LearnableAperture"):
+            camera(None).load_state_dict(optics.state_dict())
+        with pytest.raises(ValueError, match="is a LearnableAperture in the state"):
+            camera(None).load_state_dict(optics.state_dict(), take_over=True)
+
+    def test_feature_remembered_psfs_follow_it(self):
+        optics = camera(apertures())
+        with torch.no_grad():
+            first = optics(*scene())
+            assert torch.equal(optics(*scene()), first)
+        optimizer = torch.optim.Adam([optics.aperture.amplitude], lr=0.1)
+        optics(*scene()).square().mean().backward()
+        optimizer.step()
+        with torch.no_grad():
+            second = optics(*scene())
+            fresh = copy.deepcopy(optics)(*scene())
+        assert not torch.allclose(second, first, atol=1e-5)
+        assert torch.equal(second, fresh)
+
+    def test_feature_descent_opens_it_to_the_disc_that_is_asked_for(self):
+        """The masks are flat; the PSFs to be had are those of a smaller disc."""
+        wanted = circular_aperture(23, 0.1, 0.6).float()
+        flat = {"fidelity": Fidelity(window=15, layer_spacing=10.0), "camera": DefocusRange(-10, 10)}
+        masks = PixelwiseMask(1, initial="flat").requires_grad_(False)
+        target = TiDyOptics(masks, aperture=wanted, **flat).psf_bank(1).psfs
+        optics = TiDyOptics(masks, aperture=nn.Parameter(torch.full((23, 23), 0.5)), **flat)
+        optimizer, errors = torch.optim.Adam(optics.parameter_groups(1e-8, lr=0.05)[-1:]), []
+        for _ in range(60):
+            error = (optics.psf_bank(1).psfs - target).square().sum() / target.square().sum()
+            optimizer.zero_grad()
+            error.backward()
+            optimizer.step()
+            errors.append(float(error.detach()))
+        assert errors[-1] < 0.02 * errors[0]
+        amplitude = optics.aperture().detach()
+        assert float(amplitude.min()) >= 0
+        assert float(amplitude.max()) <= 1
+        assert float(amplitude[wanted > 0].mean()) > 4 * float(amplitude[wanted == 0].mean())
+
+    def test_feature_beyond_an_end_gradients_pass_where_descent_leads_back(self):
+        aperture = LearnableAperture(nn.Parameter(torch.full((2, 2), 0.5)))
+        with torch.no_grad():
+            aperture.amplitude.copy_(torch.tensor([[1.5, 1.5], [-0.5, 0.5]]))
+        (aperture() * torch.tensor([[1.0, -1.0], [-1.0, 1.0]])).sum().backward()
+        assert aperture.amplitude.grad.tolist() == [[1, 0], [-1, 1]]
+
+    @pytest.mark.parametrize("shape", [(6, 6), (2, 6, 6)])
+    def test_gradcheck(self, shape):
+        masks, (image, depth) = PixelwiseMask(2, 6).double(), scene(torch.float64)
+        image, depth = image[..., :6, :6], depth[..., :6, :6]
+        optics = TiDyOptics(masks, aperture=nn.Parameter(torch.ones(shape, dtype=torch.float64)), fidelity=EXACT)
+        optics.sensor = None
+        given = 0.2 + 0.6 * torch.rand(shape, dtype=torch.float64)
+
+        def captured(amplitude):
+            state = {"aperture.amplitude": amplitude}
+            return torch.func.functional_call(optics, state, (image, depth))
+
+        assert torch.autograd.gradcheck(captured, (given.requires_grad_(),), fast_mode=True)
+
+    @pytest.mark.slow
+    def test_dynamo(self):
+        optics = camera(apertures())
+        expected = optics(*scene())
+        expected.sum().backward()
+        wanted = optics.aperture.amplitude.grad.clone()
+        optics.zero_grad()
+        found = torch.compile(optics, backend="aot_eager")(*scene())
+        self.assert_close(found, expected, rtol=0, atol=1e-5)
+        found.sum().backward()
+        self.assert_close(optics.aperture.amplitude.grad, wanted, rtol=1e-3, atol=1e-6)
