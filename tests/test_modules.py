@@ -32,6 +32,7 @@ ARGUMENTS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "GreyLevels": lambda: (4,),
     "JointHead": lambda: (test_joint_closed_form.joint(),),
     "LearnableDwellTimes": lambda: ((0.5, 0.5),),
+    "LearnableAperture": lambda: (nn.Parameter(torch.rand(6, 6)),),
     "Lens": lambda: made_lenses.ideal_parts("own", "", lambda *x: 0 * x[2], (530e-9,), 50e-3, 8.0, 1.0, 7e-3),
     "LinearCamera": lambda: (TiDyOptics(sensor=None), torch.ones(1, 1, 40, 40)),
     "PixelCrosstalk": lambda: (0.3,),

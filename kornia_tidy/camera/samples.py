@@ -253,14 +253,15 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
     return DefocusSpan(extremes if reach is None else reach, clamped)
 
 
-def survey_scene(sample: Sample, defocus: Tensor, camera: Any) -> Tensor:
+def survey_scene(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
     """Return how far the defocus of a scene reaches, as :func:`survey_defocus` does; on an accelerator check it too.
 
     The host waits for an accelerator once, for the extremes of image, depth, defocus and masks together, and not at all
     where the camera has fixed layers. Where a check finds something it waits again, to say what.
 
     Args:
-        sample: image and depth.
+        image: of the scene, (B, C, H, W).
+        depth: of the scene.
         defocus: of the scene in radians.
         camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
 
@@ -275,19 +276,19 @@ def survey_scene(sample: Sample, defocus: Tensor, camera: Any) -> Tensor:
     camera.notes.clamped = ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum() if own.numel() else 0
     if fixed is not None or not own.numel():
         return torch.tensor(fixed or (lo, hi), requires_grad=defocus.requires_grad)
-    states, weights = camera.psf_model.states(sample.dtype)
-    looked_at = sample.image, sample.depth, own, states, weights
+    states, weights = camera.psf_model.states(own.dtype)
+    looked_at = image, depth, own, states, weights
     pairs = [torch.aminmax(x.detach()) for x in looked_at if x.numel()]
-    numbers = torch.stack([end.to(sample.dtype) for pair in pairs for end in pair]).tolist()
+    numbers = torch.stack([end.to(own.dtype) for pair in pairs for end in pair]).tolist()
     (dark, bright), (near, far), reach, *rest = zip(numbers[::2], numbers[1::2], strict=True)
     if not all(map(math.isfinite, (x for pair in rest for x in pair))):
         check_finite("the phase of the masks", states)
         check_finite("the weights of the modulator", weights)
     if camera.check_inputs:
         if not (dark >= 0 and bright <= 1):  # NaN too
-            check_light(sample.image, camera)
+            check_light(image, camera)
         if not (near > 0 and (far <= 1 or not isinstance(lens, DefocusRange))):
-            lens.defocus(sample.depth)
+            lens.defocus(depth)
         beyond = reach[0] < lo - ROUNDING or reach[1] > hi + ROUNDING
         if beyond or reach[1] <= lo + SAME_FOCUS:
             tell_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)

@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.sensor.sensor import STRIP
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """Rows of a capture, with the image and the depth that they are seen from.
+
+    Args:
+        image: (B, C, H, W) in the camera's colour space, in the type that the capture is computed in.
+        depth: (B, 1, H, W) or (1, 1, H, W).
+        border: what lies beyond the image: ``"valid"`` where it reaches as far as the PSFs.
+        rows: of the capture. Default: all.
+        reach: lowest and highest defocus of all rows, (2,). Default: to be found.
+    """
+
+    image: Tensor
+    depth: Tensor
+    border: str
+    rows: slice | None = None
+    reach: Tensor | None = None
 
 
 def rows_at_once(sample: Sample, allowed: int) -> int | None:
@@ -26,10 +46,8 @@ def rows_at_once(sample: Sample, allowed: int) -> int | None:
     return None if rows >= height else rows
 
 
-def strips_of(
-    sample: Sample, rows: int, height: int, radius: int, border: str
-) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Yield rows of a capture, with the image and the depth that they are seen from.
+def strips_of(sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor) -> Iterator[Strip]:
+    """Yield the strips of a capture.
 
     Args:
         sample: image and depth.
@@ -37,11 +55,14 @@ def strips_of(
         height: of the capture.
         radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
         border: of the capture.
+        reach: lowest and highest defocus, (2,).
     """
     sides = "replicate" if border == "zero" else border  # black has no depth of its own
     for top in range(0, height, rows):
-        strip = slice(top, min(top + rows, height))
-        yield strip, padded_band(sample.image, strip, radius, border), padded_band(sample.depth, strip, radius, sides)
+        own = slice(top, min(top + rows, height))
+        image = padded_band(sample.image, own, radius, border).to(sample.dtype)
+        depth = padded_band(sample.depth, own, radius, sides).to(sample.dtype)
+        yield Strip(image, depth, "valid", own, reach)
 
 
 def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:

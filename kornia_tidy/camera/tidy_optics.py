@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera.advice import explain_capture, plan_capture
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.dataset_transform import DatasetTransform
 from kornia_tidy.camera.samples import (
@@ -22,7 +21,7 @@ from kornia_tidy.camera.samples import (
     survey_scene,
     tell_of_defocus,
 )
-from kornia_tidy.camera.strips import placed, rows_at_once, strips_of
+from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
@@ -36,7 +35,9 @@ from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
+from kornia_tidy.render.dispatch import Explanation, explain
 from kornia_tidy.render.exposure import Rendering, render_pieces
+from kornia_tidy.render.scene import layered_scene
 from kornia_tidy.runtime.mode import Mode, torch_mode, values_unread
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.sensor.sensor import Sensor, check_sensor
@@ -44,7 +45,6 @@ from kornia_tidy.systems.presets import published_system
 
 if TYPE_CHECKING:
     from kornia_tidy.planning.render_plan import RenderPlan
-    from kornia_tidy.render.dispatch import Explanation
 
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
@@ -225,60 +225,67 @@ class TiDyOptics(CameraState):
             params: noise drawn before by :meth:`draw`, to repeat a capture or to compile one.
             generator: source of the noise (not while compiling).
         """
-        sample = read_sample(image, depth, self, generator, deferred=True)
+        sample, coded = read_sample(image, depth, self, generator, deferred=True), None
         device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
-            coded: Any = None
-            for rows, irradiance in self.strips(sample):
-                seen = self.encode(self.expose(irradiance, params, generator, rows)).to(dtype)
-                coded = seen if rows is None else placed(coded, seen, rows, self.height(sample))
-            return sample.coded(coded)
+            for strip in self.strips(sample):  # one, of the whole picture, unless memory is short
+                light, defocus = self.decode(strip.image), self.defocus(strip.depth)
+                irradiance = self.blurred(light, defocus, strip)
+                seen = self.encode(self.expose(irradiance, params, generator, strip.rows)).to(dtype)
+                coded = seen if strip.rows is None else placed(coded, seen, strip.rows, self.height(sample))
+            return sample.coded(cast("Tensor", coded))
 
-    def strips(self, sample: Sample) -> Iterator[tuple[slice | None, Tensor]]:
-        """Yield rows of a capture and their irradiance on the sensor over the whole exposure.
+    def blurred(self, light: Tensor, defocus: Tensor, strip: Strip) -> Tensor:
+        """Return the irradiance on the sensor over the whole exposure: a sum over the pieces of the PSFs.
 
-        All rows come at once, as None, unless they would take more than the memory budget.
+        Args:
+            light: (B, C, H, W) linear light.
+            defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+            strip: that they are of.
+        """
+        reach = strip.reach
+        if reach is None:
+            reach = survey_scene(strip.image, strip.depth, defocus, self)
+        given = self.compositing, self.memory_budget, defocus, light.device
+        pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given)
+        return render_pieces(light, defocus, pieces, self.rendering(light.device, strip.border))
+
+    def strips(self, sample: Sample) -> Iterator[Strip]:
+        """Yield the strips that a picture is taken in: ordinarily one, which is all of it.
 
         Args:
             sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
         """
-        channels, dtype, device = sample.image.shape[1], sample.dtype, sample.image.device
-        given, rendering, rows = (self.compositing, self.memory_budget), self.rendering(device), None
-        if sample.bytes_at_once > self.memory_budget // 2:
-            rows = self._rows_at_once(sample)
+        rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
         if rows is None:
-            light, defocus = self.decode(sample.image.to(dtype)), self.defocus(sample.depth.to(dtype))
-            reach = survey_scene(sample, defocus, self)
-            pieces = pieces_of(self.psf_model, channels, dtype, reach, *given, defocus, device)
-            yield None, render_pieces(light, defocus, pieces, rendering)
+            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border)
             return
         check_border(self.border, *sample.image.shape[-2:], self.window)
-        if device.type != "cpu":
+        if sample.image.device.type != "cpu":
             check_light(sample.image, self)
-        reach = survey_defocus((self.defocus(part.to(dtype)) for part in sample.depth.split(rows, dim=-2)), self).reach
-        rendering = replace(rendering, border="valid")
-        for strip, image, depth in strips_of(sample, rows, self.height(sample), self.window // 2, self.border):
-            light, defocus = self.decode(image.to(dtype)), self.defocus(depth.to(dtype))
-            pieces = pieces_of(self.psf_model, channels, dtype, reach, *given, defocus, device)
-            yield strip, render_pieces(light, defocus, pieces, rendering)
+        parts = sample.depth.split(rows, dim=-2)
+        reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self).reach
+        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach)
 
     def irradiance(self, sample: Sample) -> Tensor:
-        """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure. See :meth:`strips`."""
+        """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""
         whole, device = None, sample.image.device
         with torch.autocast(device.type, enabled=False), values_unread(device):
-            for rows, part in self.strips(sample):
-                whole = part if rows is None else placed(whole, part, rows, self.height(sample))
+            for strip in self.strips(sample):
+                part = self.blurred(self.decode(strip.image), self.defocus(strip.depth), strip)
+                whole = part if strip.rows is None else placed(whole, part, strip.rows, self.height(sample))
         return cast("Tensor", whole)
 
     def height(self, sample: Sample) -> int:
         """Return how many rows a capture has."""
         return sample.image.shape[-2] - (self.window - 1 if self.border == "valid" else 0)
 
-    def rendering(self, device: torch.device) -> Rendering:
-        """Return how pieces of PSFs are rendered on a device."""
+    def rendering(self, device: torch.device, border: str | None = None) -> Rendering:
+        """Return how pieces of PSFs are rendered on a device, with another border than the camera's if it is given."""
         fidelity, waits = self.psf_model.fidelity, self.fixed_defocus is None or device.type == "cpu"
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        return Rendering(self.compositing, self.border, layers, fidelity.correlate, "auto" if waits else "batched")
+        given = self.compositing, border or self.border, layers, fidelity.correlate
+        return Rendering(*given, "auto" if waits else "batched")
 
     def _rows_at_once(self, sample: Sample) -> int | None:
         """Return how many rows fit the memory allowed; None where all do, or the whole image is needed at once."""
@@ -295,16 +302,6 @@ class TiDyOptics(CameraState):
         if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed):
             allowed //= 2  # the other half is for PSFs
         return None if sample.bytes_at_once <= allowed else rows_at_once(sample, allowed)
-
-    def capture(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        params: Mapping[str, Tensor] | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Take a picture of an image and its depth. See :meth:`forward`."""
-        return self.forward(image, depth, params, generator)
 
     def _replace(self, **attributes: Any) -> Self:
         """Return a camera with other attributes. Parts, notes and remembered PSFs are shared."""
@@ -391,11 +388,21 @@ class TiDyOptics(CameraState):
             >>> plan.predicted_error <= 1e-2
             True
         """
-        return plan_capture(self, depth, image, tolerance)
+        from kornia_tidy.planning.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
+
+        shape = (len(self.spectrum.weights), *depth.shape[-2:])
+        blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image
+        sample = read_sample(blank, depth, self)
+        if len(sample.image) == 0 or len(sample.depth) == 0:
+            found = f"{len(sample.image)} and {len(sample.depth)}"
+            raise ValueError(f"a plan needs at least one image and its depth, got {found}")
+        light = None if image is None else self.decode(sample.image.to(sample.dtype))
+        defocus = self.defocus(sample.depth.to(compute_dtype(depth.dtype, self.fidelity, depth.device)))
+        return plan_scene(self, defocus, light, (len(sample.image), sample.image.shape[1]), tolerance)
 
     @torch.no_grad()
     def explain(self, image: Tensor, depth: Tensor) -> Explanation:
-        """Return which backend renders a scene, with operations and memory of each.
+        """Return which backend renders a scene, of several pieces the first, with operations and memory of each.
 
         Args:
             image: (B, C, H, W) or (C, H, W), as for a capture.
@@ -410,7 +417,22 @@ class TiDyOptics(CameraState):
               dense: ... operations, ... MiB
             ...
         """
-        return explain_capture(self, image, depth)
+        sample = read_sample(image, depth, self)
+        if len(sample.image) == 0:
+            raise ValueError("an explanation needs at least one image, got a batch of none")
+        light, defocus = self.decode(sample.image.to(sample.dtype)), self.defocus(sample.depth.to(sample.dtype))
+        reach, (batch, channels, height, width) = survey_defocus([defocus], self).reach, light.shape
+        given = self.compositing, self.memory_budget, defocus
+        pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
+        if pieces[0].window is not None:
+            groups = ", ".join(f"{len(piece.bank().defocus)} on grids of {piece.grid} px" for piece in pieces)
+            words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
+            return Explanation(words, "grids", {}, {})
+        bank, how = pieces[0].bank(), asdict(self.rendering(light.device))
+        del how["method"]
+        light = light.repeat(1, bank.psfs.shape[1] // channels, 1, 1)
+        found = explain(layered_scene(light, defocus, bank.defocus, bank.psfs, bank.veil, **how))
+        return found if len(pieces) == 1 else replace(found, scene=f"{found.scene}, the first of {len(pieces)} pieces")
 
     # ------------------------------------------------------------------ training, data sets, people
 

@@ -323,9 +323,12 @@ class PSFModel:
         side, grid = self.window if traced else self.fitted.side, 1  # the light in it is measured at the first PSFs
         if group is not None:
             side, grid = group.window, group.grid
-        pupil, learning = self._shown_pupil, torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        learning = learning or pupil.amplitude.requires_grad
-        exact = partial(self._exact_psfs, spectrum, grid, pupil)
+        learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
+        compared = weights
+        if isinstance(self.aperture, LearnableAperture):
+            amplitude = self._shown_pupil.amplitude.to(weights)
+            learning, compared = learning or amplitude.requires_grad, torch.cat([weights, amplitude.flatten()])
+        exact = partial(self._exact_psfs, spectrum, grid)
         build = partial(exact, states, weights, window=side, each_state=each_state)
         if (blur := self.wide_blur) is not None and not traced and not each_state:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
@@ -334,27 +337,24 @@ class PSFModel:
                 bank = learnt_bank(bank, exact, states, weights, grid)
                 return bank if stray_light is None else bank.with_stray_light(*stray_light)
             shares = [sum(row) for row in spectrum.plane_weights]
-            lens = blur, pupil, float(self.pixel_step), grid, shares, side
+            lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
         memories, unread = self._memories, Mode.UNREAD in torch_mode()
         if memories is None or learning or traced or unread or next(self.camera.parameters(), None) is not None:
             bank = build(nodes)
             return bank if stray_light is None else bank.with_stray_light(*stray_light)
-        setting = [side, self.fidelity, self._aperture_mark, pupil.fill_factor]
+        setting = [side, self.fidelity, self._aperture_mark, getattr(self.modulator, "fill_factor", 1.0)]
         setting += [None if self.lens is None else self.lens.table]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
         key = self.moment, self.state, torch.get_num_threads(), grid
         memory = memories.get(key) or memories.setdefault(key, BankMemory())
-        if isinstance(self.aperture, LearnableAperture):
-            weights = torch.cat([weights, pupil.amplitude.to(weights).flatten()])  # compared by value as well
-        return memory.recall(spectrum, setting, states, weights, nodes, build, stray_light)
+        return memory.recall(spectrum, setting, states, compared, nodes, build, stray_light)
 
     def _exact_psfs(
         self,
         spectrum: Spectrum,
         grid: int,
-        pupil: Pupil,
         states: Tensor,
         weights: Tensor,
         nodes: tuple[float, ...],
@@ -363,6 +363,7 @@ class PSFModel:
         each_state: bool = False,
         tolerance: float | None = None,
     ) -> PSFBank:
+        pupil = self._shown_pupil
         if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
             check_finite("the phase of the masks", states)
             if isinstance(self.aperture, LearnableAperture):
@@ -622,8 +623,8 @@ class PSFModel:
         """
         lo, hi = self.camera.defocus_range
         nodes = tuple(sorted({lo, min(max(0.0, lo), hi), hi}))
-        shown = self._shown_pupil, *self.states(torch.float32)
-        psfs = self._exact_psfs(self._sampled.flat(), 1, *shown, nodes, size, tolerance=_SAMPLING).psfs
+        states = self.states(torch.float32)
+        psfs = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, size, tolerance=_SAMPLING).psfs
         return psfs if self.fidelity.propagation == "paper" else psfs / self.pupil.field_share
 
     def _check_layers(self) -> None:
@@ -714,7 +715,7 @@ class PSFModel:
         for radius in (0.0, 2.0, SMALLEST_WIDE_RADIUS):
             nodes = (radius * math.pi * step / REFERENCE_WAVELENGTH,)
             side = window_of(radius, step, self.pupil.extent)
-            bank = self._exact_psfs(self._sampled.flat(), 1, self.pupil, *states, nodes, side, tolerance=_SAMPLING)
+            bank = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, side, tolerance=_SAMPLING)
             shares.append(bank.energy)
         return float(torch.cat(shares).min()), float(torch.cat(shares).max())
 

@@ -69,7 +69,8 @@ class Pupil:
         Args:
             amplitude: (n, n), or (K, n, n) for K masks.
         """
-        pupil, light = copy.copy(self), amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
+        pupil = copy.copy(self)
+        light = amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
         shared = amplitude.detach().double().square()
         transmission = (shared if shared.ndim == 2 else shared.mean(0)).cpu()
         vars(pupil).update(amplitude=amplitude / light.sqrt(), transmission=transmission, light=1.0)

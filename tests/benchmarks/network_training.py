@@ -132,7 +132,7 @@ def scores(module: TidyTraining) -> dict[float, list[float]]:
         for noise in NOISES:
             module.optics.sensor = SensorNoise(noise)
             generator = torch.Generator().manual_seed(number)
-            coded = module.optics.capture(truth, sample["depth"][None], generator=generator)
+            coded = module.optics(truth, sample["depth"][None], generator=generator)
             found[noise] += psnr(module(coded, torch.full((1, 1, 1, 1), noise)).clamp(0, 1), truth).tolist()
             if noise == NOISES[0]:
                 found[0.0] += psnr(coded, truth).tolist()

@@ -106,7 +106,7 @@ class TestFewerWavelengths(BaseTester):
     def test_dynamo(self):
         own = TiDyOptics(PixelwiseMask(1), sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=2))
         image, depth = torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)
-        compiled = torch.compile(own.capture, backend="eager", fullgraph=True)
+        compiled = torch.compile(own, backend="eager", fullgraph=True)
         self.assert_close(compiled(image, depth), own(image, depth))
 
     @pytest.mark.parametrize("count", [0, -1, 1.5])

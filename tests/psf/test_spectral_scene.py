@@ -93,7 +93,7 @@ class TestSpectralScene(BaseTester):
         optics = camera(spectrum)
         one = torch.rand(6, 9, 9, dtype=torch.float64) / 90
 
-        def alike(self, light, grid, pupil, states, weights, nodes, window, **_):
+        def alike(self, light, grid, states, weights, nodes, window, **_):
             rows = torch.tensor(light.plane_weights, dtype=torch.float64).sum(1)
             psfs = one[: len(nodes), None] * rows[:, None, None]
             return PSFBank(psfs, torch.tensor(nodes, dtype=torch.float64), psfs.sum((2, 3)))
