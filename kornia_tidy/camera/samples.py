@@ -6,10 +6,10 @@ import math
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, Protocol, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
 from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_cropped_valid, with_filled
@@ -49,6 +49,7 @@ class Watchful(Protocol):
     holes: str
     color_space: str
     notes: Notes
+    fixed_defocus: tuple[float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def read_sample(
         depth: the depth map, if ``image`` is a tensor.
         camera: says what it takes.
         generator: source of the noise, to be checked before any work.
-        deferred: leave the light on an accelerator to :func:`survey_scene`.
+        deferred: leave the light on an accelerator to :func:`survey_unread`.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or the generator is none.
@@ -205,30 +206,23 @@ def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
     return sample["image"], sample[keys[0]]
 
 
-class DefocusSpan(NamedTuple):
-    """How far the defocus of a scene reaches, and how many of its pixels lie beyond the camera's range.
-
-    Args:
-        reach: lowest and highest defocus in radians, (2,); the map itself where it is learnt or cannot be looked at.
-        clamped: number of pixels that are rendered as the ends of the range.
-    """
-
-    reach: Tensor
-    clamped: Tensor | int = 0
-
-
-def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
+def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> Tensor:
     """Return how far the defocus of a scene reaches; note and, once, tell of pixels beyond the camera's range.
 
     Args:
         parts: of the defocus map, in radians.
         camera: its range of defocus.
+
+    Returns:
+        Lowest and highest defocus in radians, (2,); the map itself where it is learnt or cannot be looked at; the range
+        of the camera's fixed layers where it has such.
     """
+    fixed = camera.fixed_defocus
     lo, hi = camera.psf_model.camera.defocus_range
     extremes, pixels, clamped, reach = torch.zeros(2), 0, 0, None
     for defocus in parts:
         if Mode.GRAPH in torch_mode():
-            return DefocusSpan(defocus)
+            return defocus if fixed is None else torch.tensor(fixed, requires_grad=defocus.requires_grad)
         own = defocus.detach()
         if not own.numel():
             continue
@@ -247,14 +241,16 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> DefocusSpan:
             "the whole picture is rendered through the PSFs of the lens's axis, which differ from those of the field: "
             "field_bank([...]) shows by how much"
         )
-        tell_once(camera.notes.told, "field", said, stacklevel=6)
+        tell_once(camera.notes.told, "field", said, stacklevel=7)
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
         tell_of_defocus(extremes, camera, pixels, int(clamped))
-    return DefocusSpan(extremes if reach is None else reach, clamped)
+    if fixed is not None:
+        return torch.tensor(fixed, requires_grad=reach is not None and reach.requires_grad)
+    return extremes if reach is None else reach
 
 
-def survey_scene(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
-    """Return how far the defocus of a scene reaches, as :func:`survey_defocus` does; on an accelerator check it too.
+def survey_unread(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
+    """Return how far the defocus of a scene on an accelerator reaches, and check the scene and the masks.
 
     The host waits for an accelerator once, for the extremes of image, depth, defocus and masks together, and not at all
     where the camera has fixed layers. Where a check finds something it waits again, to say what.
@@ -266,24 +262,24 @@ def survey_scene(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> 
         camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
 
     Returns:
-        Lowest and highest defocus in radians, (2,), or the defocus map, as far as PSFs are needed for it.
+        Lowest and highest defocus in radians, (2,), as far as PSFs are needed for it.
     """
     fixed, lens = camera.fixed_defocus, camera.psf_model.camera
-    if Mode.UNREAD not in torch_mode():
-        span = survey_defocus([defocus], camera)
-        return span.reach if fixed is None else torch.tensor(fixed, requires_grad=defocus.requires_grad)
     own, (lo, hi) = defocus.detach(), lens.defocus_range
     camera.notes.clamped = ((own < lo - ROUNDING) | (own > hi + ROUNDING)).sum() if own.numel() else 0
     if fixed is not None or not own.numel():
         return torch.tensor(fixed or (lo, hi), requires_grad=defocus.requires_grad)
     states, weights = camera.psf_model.states(own.dtype)
-    looked_at = image, depth, own, states, weights
+    aperture = list(camera.aperture.parameters()) if isinstance(camera.aperture, nn.Module) else []
+    looked_at = image, depth, own, states, weights, *aperture
     pairs = [torch.aminmax(x.detach()) for x in looked_at if x.numel()]
     numbers = torch.stack([end.to(own.dtype) for pair in pairs for end in pair]).tolist()
     (dark, bright), (near, far), reach, *rest = zip(numbers[::2], numbers[1::2], strict=True)
     if not all(map(math.isfinite, (x for pair in rest for x in pair))):
         check_finite("the phase of the masks", states)
         check_finite("the weights of the modulator", weights)
+        for amplitude in aperture:
+            check_finite("the aperture", amplitude)
     if camera.check_inputs:
         if not (dark >= 0 and bright <= 1):  # NaN too
             check_light(image, camera)
@@ -307,7 +303,7 @@ def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped
     lens = camera.psf_model.camera
     said = misread_depth(lens, *extremes)
     if said is not None:
-        tell_once(camera.notes.told, "depth", said, stacklevel=7)
+        tell_once(camera.notes.told, "depth", said, stacklevel=8)
     elif clamped:
         (lo, hi), (lowest, highest) = lens.defocus_range, extremes.tolist()
         tell_once(
@@ -316,5 +312,5 @@ def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped
             f"{clamped} of {pixels} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
             f"the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
             f"ThinLensCamera.for_scene, or its depth_range)",
-            stacklevel=7,
+            stacklevel=8,
         )

@@ -18,7 +18,7 @@ from kornia_tidy.camera.samples import (
     compute_dtype,
     read_sample,
     survey_defocus,
-    survey_scene,
+    survey_unread,
     tell_of_defocus,
 )
 from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
@@ -243,9 +243,9 @@ class TiDyOptics(CameraState):
             defocus: (B, 1, H, W) or (1, 1, H, W) radians.
             strip: that they are of.
         """
-        reach = strip.reach
-        if reach is None:
-            reach = survey_scene(strip.image, strip.depth, defocus, self)
+        if (reach := strip.reach) is None:
+            scene = strip.image, strip.depth, defocus
+            reach = survey_unread(*scene, self) if Mode.UNREAD in torch_mode() else survey_defocus([defocus], self)
         given = self.compositing, self.memory_budget, defocus, light.device
         pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given)
         return render_pieces(light, defocus, pieces, self.rendering(light.device, strip.border))
@@ -264,7 +264,7 @@ class TiDyOptics(CameraState):
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
-        reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self).reach
+        reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self)
         yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach)
 
     def irradiance(self, sample: Sample) -> Tensor:
@@ -421,7 +421,7 @@ class TiDyOptics(CameraState):
         if len(sample.image) == 0:
             raise ValueError("an explanation needs at least one image, got a batch of none")
         light, defocus = self.decode(sample.image.to(sample.dtype)), self.defocus(sample.depth.to(sample.dtype))
-        reach, (batch, channels, height, width) = survey_defocus([defocus], self).reach, light.shape
+        reach, (batch, channels, height, width) = survey_defocus([defocus], self), light.shape
         given = self.compositing, self.memory_budget, defocus
         pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
         if pieces[0].window is not None:

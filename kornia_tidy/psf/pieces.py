@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -101,29 +102,27 @@ def pieces_of(
             return
         _check_wide_bytes(blur, channels, dtype, compositing, budget)
     most, remembered = None, True
-    bytes_at_most = _MOST_COPIES * channels * dtype.itemsize * model.most_samples
-    if blur is None and budget is not None and bytes_at_most > budget // 2:
-        most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
-    source, device = model if remembered else model.without_memory(), device or reach.device
-    cut = compositing == "occlusion" and (blur is not None or model.measured_cut)  # discs of rays end
-
-    def make(part: PSFModel, reach: Tensor, *, each_state: bool = False) -> PSFBank:
-        bank = part.scene_bank(channels, dtype, reach, each_state=each_state, device=device)
-        return bank.with_tails() if cut else bank
-
+    if blur is None and budget is not None and not torch_mode():
+        side = max(model.fidelity.window or model.fidelity.max_window, model.fitted.side)
+        if _MOST_COPIES * channels * dtype.itemsize * len(model.defocus_nodes) * side**2 > budget // 2:
+            most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
+    source = model if remembered else model.without_memory()
+    make = partial(PSFModel.scene_bank, channels=channels, dtype=dtype, device=device or reach.device)
+    if compositing == "occlusion" and (blur is not None or model.measured_cut):  # discs of rays end
+        make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
         if Mode.UNREAD in torch_mode():  # all states in one bank, for one rendering
-            yield Piece(partial(make, source, reach, each_state=True), shares)
+            yield Piece(partial(make, source, defocus=reach, each_state=True), shares)
             return
         for state, share in enumerate(shares):
-            yield Piece(partial(make, source.of_state(state), reach), share, keep=most is None)
+            yield Piece(partial(make, source.of_state(state), defocus=reach), share, keep=most is None)
     elif most is None:
-        yield Piece(partial(make, source, reach))
+        yield Piece(partial(make, source, defocus=reach))
     else:
         for span in _runs(model.defocus_nodes, scene, most - 1):
             ends = torch.tensor(span, dtype=torch.float64)
-            yield Piece(partial(make, source, ends), span=_open_ended(span, model.defocus_nodes), keep=False)
+            yield Piece(partial(make, source, defocus=ends), span=_open_ended(span, model.defocus_nodes), keep=False)
 
 
 def comes_in_pieces(model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int) -> bool:
@@ -183,6 +182,10 @@ def _most_layers(
     if layers * (psfs + work) <= allowed:
         return whole
     return max(2, allowed // (psfs + work)), layers * psfs <= allowed
+
+
+def _with_tails(make: Callable[..., PSFBank], *given: Any, **options: Any) -> PSFBank:
+    return make(*given, **options).with_tails()
 
 
 def _wide_pieces(model: PSFModel, blur: WideBlur, channels: int, dtype: torch.dtype, scene: Tensor) -> Iterator[Piece]:

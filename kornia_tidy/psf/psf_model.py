@@ -572,13 +572,6 @@ class PSFModel:
         return self.fitted.side
 
     @property
-    def most_samples(self) -> float:
-        """Samples of the PSFs of all the camera's range, at one wavelength, without measuring their window: at most."""
-        (lo, hi), known = self.camera.defocus_range, self._derived.window
-        side = max(self.fidelity.window or self.fidelity.max_window, 0 if known is None else known.side)
-        return ((hi - lo) / self.fidelity.layer_spacing + 1) * side**2
-
-    @property
     def fitted(self) -> FittedWindow:
         """The window and the share of the light in it, measured with the masks as they were at the first look."""
         _ = self.wide_blur  # which drops the window of flat masks that have been learnt since
