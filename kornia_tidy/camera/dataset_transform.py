@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from itertools import chain
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_cropped_valid, with_filled
+from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_filled
 from kornia_tidy.camera.image_types import cropped_image, depth_tensor, filled_depth, image_tensor, like_image
+from kornia_tidy.camera.samples import with_capture
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.render.repeatable import repeatable
@@ -90,8 +91,7 @@ class DatasetTransform:
     def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
         """Return the sample with its image coded; arrays and PIL images are converted to tensors and back."""
         options = {} if generator is None else {"generator": generator}
-        named = isinstance(sample, Mapping)
-        if named:
+        if isinstance(sample, Mapping):
             names = self._names(sample)
             image, depth = (sample[name] for name in names)
             plain = names[0] == "image" and names[1] in DEPTH_KEYS
@@ -111,14 +111,7 @@ class DatasetTransform:
         coded = self.optics(whole.to(device), depth_tensor(depth, self.depth_scale).to(device), **options)
         coded = coded.to(whole.device)
         margin = (whole.shape[-2] - coded.shape[-2]) // 2
-        taken, warped = like_image(coded, image), cropped_image(depth, margin)
-        sample = with_cropped_valid(sample, margin, cropped_image)
-        if not named:
-            parts, make = (taken, warped, *sample[2:]), cast("Any", type(sample))
-            return make(*parts) if hasattr(sample, "_fields") else make(parts)
-        mask = {"mask": cropped_image(sample["mask"], margin)} if margin and "mask" in sample else {}
-        clean = cropped_image(image, margin)
-        return {**sample, "all_in_focus": clean, **mask, names[0]: taken, names[1]: warped}
+        return with_capture(sample, like_image(coded, image), margin, names, cropped_image)
 
     def _names(self, sample: Mapping[str, Any]) -> tuple[str, str]:
         """Return the names of image and depth in a mapping."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from kornia_tidy.optics.thin_lens import DefocusRange
@@ -76,21 +76,6 @@ def both_valid(valid: Any, earlier: Any) -> Any:
     if shape != found:
         raise ValueError(f"valid must have the depth's shape {shape}, got {found}")
     return valid & (earlier > 0)
-
-
-def with_cropped_valid(sample: Any, margin: int, crop: Callable[[Any, int], Any]) -> Any:
-    """Return a sample whose mask of valid pixels, if it has one, is without so many pixels on each side.
-
-    Args:
-        sample: a mapping with an entry ``"valid"``, a named tuple with such a field, or another one.
-        margin: pixels.
-        crop: crops a map.
-    """
-    named = isinstance(sample, Mapping)
-    valid = sample.get("valid") if named else getattr(sample, "valid", None)
-    if not margin or len(getattr(valid, "shape", ())) < 2:
-        return sample
-    return {**sample, "valid": crop(valid, margin)} if named else sample._replace(valid=crop(valid, margin))
 
 
 def known_in(sample: Mapping[str, Any], valid: Any) -> Any:

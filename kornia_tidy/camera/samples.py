@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Protocol, cast
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_cropped_valid, with_filled
+from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_filled
 from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.holes import fill_holes
@@ -89,12 +89,45 @@ class Sample:
             coded = coded[0]
         if self.form is None:
             return coded
-        form = with_cropped_valid(self.form, margin, cropped)
-        if not isinstance(form, Mapping):
-            parts, make = (coded, cropped(form[1], margin), *form[2:]), cast("Any", type(form))
-            return make(*parts) if hasattr(form, "_fields") else make(parts)
-        maps = {name: cropped(form[name], margin) for name in (*DEPTH_KEYS, "mask") if name in form}
-        return {**form, "image": coded, "all_in_focus": cropped(form["image"], margin), **maps}
+        return with_capture(self.form, coded, margin)
+
+
+def with_capture(
+    sample: Any,
+    coded: Any,
+    margin: int,
+    names: Sequence[str] = ("image", *DEPTH_KEYS),
+    crop: Callable[[Any, int], Any] = cropped,
+) -> Any:
+    """Return a sample with its capture in the place of the image, and its maps cropped to the size of the capture.
+
+    Args:
+        sample: a mapping, which gets the clean image under ``"all_in_focus"``; or a tuple or list
+            ``(image, depth, ...)``. A mask of valid pixels is an entry or a field of a named tuple.
+        coded: the capture.
+        margin: pixels that it lacks on each side.
+        names: of the image, and those that a mapping may have the depth under.
+        crop: crops a map or an image.
+
+    Example:
+        >>> with_capture((torch.zeros(1, 4, 4), torch.ones(1, 4, 4)), torch.ones(1, 2, 2), 1)[1].shape
+        torch.Size([1, 2, 2])
+    """
+    named = isinstance(sample, Mapping)
+    valid = sample.get("valid") if named else getattr(sample, "valid", None)
+    if len(getattr(valid, "shape", ())) < 2:  # no map
+        valid = None
+    if named:
+        maps = {name: sample[name] for name in (*names[1:], "mask") if name in sample}
+        maps |= {} if valid is None else {"valid": valid}
+        smaller = {name: crop(value, margin) for name, value in maps.items()} if margin else {}
+        return {**sample, names[0]: coded, "all_in_focus": crop(sample[names[0]], margin), **smaller}
+    parts, make = [coded, crop(sample[1], margin), *sample[2:]], cast("Any", type(sample))
+    if not hasattr(sample, "_fields"):
+        return make(parts)
+    if valid is not None:
+        parts[sample._fields.index("valid")] = crop(valid, margin)
+    return make(*parts)
 
 
 def read_sample(

@@ -29,6 +29,7 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolable_spacing,
     interpolated_bank,
 )
+from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.field_bank import FieldBank, check_field, field_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
@@ -36,7 +37,7 @@ from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory, nodes_around, plain_attributes
-from kornia_tidy.psf.psf_ops import computed_psf_bank
+from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
@@ -326,7 +327,7 @@ class PSFModel:
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
         compared = weights
         if isinstance(self.aperture, LearnableAperture):
-            amplitude = self._shown_pupil.amplitude.to(weights)
+            amplitude = self.pupil.amplitude.to(weights)
             learning, compared = learning or amplitude.requires_grad, torch.cat([weights, amplitude.flatten()])
         exact = partial(self._exact_psfs, spectrum, grid)
         build = partial(exact, states, weights, window=side, each_state=each_state)
@@ -363,7 +364,7 @@ class PSFModel:
         each_state: bool = False,
         tolerance: float | None = None,
     ) -> PSFBank:
-        pupil = self._shown_pupil
+        pupil = self.pupil
         if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
             check_finite("the phase of the masks", states)
             if isinstance(self.aperture, LearnableAperture):
@@ -391,9 +392,12 @@ class PSFModel:
                 )
             return paper_psf_bank(states, weights, pupil.amplitude, spectrum, dispersion, nodes, shift)
         tolerance = self.fidelity.pixel_tolerance if tolerance is None else tolerance
-        lens = pupil, spectrum, dispersion, nodes, self.pixel_step * grid, window, tolerance, shift
-        remember = self._memories is not None
-        return computed_psf_bank(states, weights, *lens, each_state=each_state, remember=remember)
+        step = self.pixel_step * grid
+        light = states, weights, pupil, spectrum, dispersion, nodes
+        plain = isinstance(self.aperture, LearnableAperture) or each_state  # compiled as plain operations
+        if torch_mode() == Mode.GRAPH and not (plain or isinstance(step, Tensor)):
+            return operator_psf_bank(*light, step, window, tolerance, shift)
+        return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._memories is not None)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)
@@ -634,13 +638,10 @@ class PSFModel:
             elif self.lens is not None and self.aperture is None:  # its stop is the edge
                 aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
-        return pupil.with_learnt(self.aperture()) if isinstance(self.aperture, LearnableAperture) else pupil
-
-    @property
-    def _shown_pupil(self) -> Pupil:
-        """The pupil of the states that are looked through."""
-        shown = self.state if self.moment is None else self.moment
-        return self.pupil if shown is None else self.pupil.of_masks(slice(shown, shown + 1))
+        if not isinstance(self.aperture, LearnableAperture):
+            return pupil
+        pupil, shown = pupil.with_learnt(self.aperture()), self.state if self.moment is None else self.moment
+        return pupil if shown is None else pupil.of_masks(slice(shown, shown + 1))
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)

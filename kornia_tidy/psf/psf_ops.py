@@ -19,7 +19,7 @@ from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
+from kornia_tidy.runtime.mode import recording_in_operator
 
 _LENS = (
     "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float light,"
@@ -32,53 +32,6 @@ _memory = BankMemory()
 
 torch.library.define("kornia_tidy::exact_psfs", f"({_LENS}) -> Tensor")
 torch.library.define("kornia_tidy::exact_psfs_gradients", f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]")
-
-
-def computed_psf_bank(
-    phase: Tensor,
-    weights: Tensor,
-    pupil: Pupil,
-    spectrum: Spectrum,
-    dispersion: Sequence[float],
-    defocus: Sequence[float],
-    pixel_step: float | Tensor,
-    window: int,
-    tolerance: float,
-    chromatic_defocus: Sequence[float],
-    *,
-    each_state: bool = False,
-    remember: bool = True,
-) -> PSFBank:
-    """Return the bank of :func:`kornia_tidy.psf.exact.exact_psf_bank`, by the operator while compiling.
-
-    A sensor pixel with a gradient, an aperture that is learnt and PSFs of each state are compiled as plain operations.
-
-    Args:
-        phase: as there, as all others.
-        weights: as there.
-        pupil: as there.
-        spectrum: as there.
-        dispersion: as there.
-        defocus: as there.
-        pixel_step: as there.
-        window: as there.
-        tolerance: as there.
-        chromatic_defocus: as there.
-        each_state: as there.
-        remember: as there.
-
-    Example:
-        >>> flat, pupil = torch.zeros(1, 23, 23), Pupil(torch.ones(23, 23), 0.1)
-        >>> lens = pupil, Spectrum.monochrome(), [1.0], [0.0], 2e-7, 23, 1e-2, [0.0]
-        >>> computed_psf_bank(flat, torch.ones(1), *lens).psfs.shape
-        torch.Size([1, 1, 23, 23])
-    """
-    lens = pupil, spectrum, dispersion, defocus
-    learnt = isinstance(pixel_step, Tensor) or pupil.amplitude.requires_grad or pupil.amplitude.ndim == 3
-    if torch_mode() == Mode.GRAPH and not (learnt or each_state):
-        return operator_psf_bank(phase, weights, *lens, pixel_step, window, tolerance, chromatic_defocus)
-    lens = *lens, pixel_step, window, tolerance, chromatic_defocus
-    return exact_psf_bank(phase, weights, *lens, each_state, remember)
 
 
 def operator_psf_bank(

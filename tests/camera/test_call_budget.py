@@ -11,14 +11,21 @@ import pytest
 import torch
 
 import kornia_tidy
-from kornia_tidy import TiDyOptics
+from kornia_tidy import NoMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.data import dead_leaves
 from tests.base import BaseTester
 from tests.kernels.operator_tester import needs_compiler
 
 PACKAGE = Path(kornia_tidy.__file__).parent
 
-FUNCTIONS, FILES, DEPTH = 57, 22, 9  # the limits of a remembered capture
+# Functions, files and depth at most. Counted are what a reader of such a capture meets, the backward pass too.
+LIMITS = {
+    "flat": (56, 22, 9),
+    "leaves": (56, 22, 9),
+    "gradient": (100, 32, 12),
+    "new scene": (88, 30, 13),
+    "wide lens": (79, 28, 13),
+}
 
 Call = tuple[str, str, int]  # file, function, and how many functions of ours are called in one another
 
@@ -56,33 +63,52 @@ def listed(calls: list[Call]) -> str:
     return "\n" + "\n".join(f"{'  ' * depth}{file} {name}" for file, name, depth in dict.fromkeys(calls))
 
 
-@pytest.fixture(scope="module", params=["flat", "leaves"])
-def calls(request) -> list[Call]:
-    """Of the second capture of a scene of 256 x 256 pixels, without gradients, by the camera as it comes."""
+@pytest.fixture(scope="module", params=LIMITS)
+def counted(request) -> tuple[str, list[Call]]:
+    """The second capture of a scene of 256 x 256 pixels by the camera as it comes, or by an f/2 lens without a mask."""
     optics, image = TiDyOptics(), torch.rand(1, 3, 256, 256)
     depth = torch.full((1, 1, 256, 256), 0.9)
-    if request.param == "leaves":
-        leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
+    leaves = dead_leaves(256, 256, depth_range=(0.3, 10.0), num_leaves=60)
+    if request.param == "wide lens":
+        lens = ThinLensCamera(f_number=2.8, focus_distance=2.0, pixel_pitch=6e-6)
+        optics, leaves = TiDyOptics(NoMask(), lens), (leaves[0], leaves[1].clamp(min=1.5))
+    if request.param in {"leaves", "wide lens"}:
         image, depth = (part[None] for part in leaves)
+    if request.param == "gradient":
+        optics(image, depth).sum().backward()
+        return request.param, calls_of(lambda: optics(image, depth).sum().backward())
     with torch.no_grad():
         optics(image, depth)
-        return calls_of(lambda: optics(image, depth))
+        if request.param == "new scene":
+            depth = torch.linspace(0.35, 9.0, 256).expand(1, 1, 256, 256)
+        return request.param, calls_of(lambda: optics(image, depth))
+
+
+@pytest.fixture
+def calls(counted) -> list[Call]:
+    return counted[1]
+
+
+@pytest.fixture
+def limits(counted) -> tuple[int, int, int]:
+    return LIMITS[counted[0]]
 
 
 @needs_compiler  # the limits are those of the compiled backend
 class TestCallBudget(BaseTester):
-    def test_feature_functions(self, calls):
-        assert len({call[:2] for call in calls}) <= FUNCTIONS, listed(calls)
+    def test_feature_functions(self, calls, limits):
+        assert len({call[:2] for call in calls}) <= limits[0], listed(calls)
 
-    def test_feature_files(self, calls):
-        assert len({file for file, _, _ in calls}) <= FILES, listed(calls)
+    def test_feature_files(self, calls, limits):
+        assert len({file for file, _, _ in calls}) <= limits[1], listed(calls)
 
-    def test_feature_depth(self, calls):
-        assert max(depth for _, _, depth in calls) <= DEPTH, listed(calls)
+    def test_feature_depth(self, calls, limits):
+        assert max(depth for _, _, depth in calls) <= limits[2], listed(calls)
 
     def test_feature_every_part_of_the_flow_is_seen(self, calls):
         """Or the limits would be kept by looking away."""
         files = {file for file, _, _ in calls}
         assert {"camera/tidy_optics.py", "psf/psf_cache.py", "sensor/noise.py", "optics/thin_lens.py"} <= files
-        assert {"render/scene.py", "render/dispatch.py"} <= files
-        assert any(file.startswith("render/backends/") for file in files)
+        wide = "psf/wide_psfs.py" in files  # such a lens is convolved on coarse grids
+        assert ({"render/coarse_gather.py"} if wide else {"render/scene.py", "render/dispatch.py"}) <= files
+        assert wide or any(file.startswith("render/backends/") for file in files)

@@ -144,7 +144,7 @@ class TestThreads(BaseTester):
         optics = camera()
         for sample in SAMPLES:
             optics(*sample)
-        monkeypatch.setattr(module, "computed_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
+        monkeypatch.setattr(module, "exact_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
         for sample in SAMPLES:
             optics(*sample)
 

@@ -24,13 +24,13 @@ def depths_built(optics: TiDyOptics, depth: torch.Tensor) -> int:
     """Number of depths whose PSFs a capture computes."""
     image = torch.rand(depth.shape[0], 3, *depth.shape[-2:])
     built = []
-    real = module.computed_psf_bank
+    real = module.exact_psf_bank
 
     def spy(*arguments, **options):
         built.extend(arguments[5])
         return real(*arguments, **options)
 
-    with patch.object(module, "computed_psf_bank", spy):
+    with patch.object(module, "exact_psf_bank", spy):
         optics(image, depth)
     return len(built)
 
