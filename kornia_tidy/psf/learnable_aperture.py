@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.checks import check_values
 from kornia_tidy.masks.limits import clamped
 
 
@@ -42,6 +43,7 @@ class LearnableAperture(nn.Module):
         shape = tuple(amplitude.shape)
         if len(shape) not in (2, 3) or shape[-1] != shape[-2] or 0 in shape:
             raise ValueError(f"a learnable aperture must have shape (N, N), or (K, N, N) for K masks, got {shape}")
+        check_values("aperture", amplitude)
         own = amplitude.detach()
         valid = (own >= 0) & (own <= 1)  # False for NaN too
         if not bool(valid.all()):
