@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
-from kornia_tidy import Fidelity, SensorNoise, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import pupil_field
 from kornia_tidy.render.compositing import gather
@@ -235,3 +236,13 @@ class TestCounts:
             device.reset()
             optics(*map(device.put, scene()))
             assert device.waits == 1
+
+
+class TestLearnableApertures(AcceleratorTester):
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
+    @pytest.mark.parametrize("shape", [(23, 23), (3, 23, 23)])
+    def test_feature_one_for_all_masks_or_one_for_each(self, shape, compositing):
+        aperture = nn.Parameter(0.3 + 0.5 * torch.rand(shape, generator=torch.Generator().manual_seed(3)))
+        options = {"compositing": compositing, "sensor": None, "fidelity": fidelity_of("balanced")}
+        self.assert_agrees(TiDyOptics(PixelwiseMask(3), aperture=aperture, **options), *scene())

@@ -241,6 +241,7 @@ class TestLearnableAperture(BaseTester):
         assert torch.autograd.gradcheck(captured, (given.requires_grad_(),), fast_mode=True)
 
     @pytest.mark.slow
+    @pytest.mark.filterwarnings("ignore:.*should not be instantiated")
     def test_dynamo(self):
         optics = camera(apertures())
         expected = optics(*scene())
