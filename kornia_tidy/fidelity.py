@@ -90,6 +90,9 @@ class Fidelity:
             layers by the radius of the disc, convolves large discs on coarser grids, and takes geometric-optics PSFs
             for them, see :mod:`kornia_tidy.psf.wide_blur`. ``"waves"`` keeps evenly spaced layers of exact PSFs in one
             window. Any mask that is not flat is always rendered by waves.
+        field_tolerance: relative error (L2) that PSFs of a real lens may have between the places over the picture at
+            which they are computed; there are as many of these as it takes, see
+            :func:`kornia_tidy.psf.field_nodes.field_nodes`.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -115,6 +118,7 @@ class Fidelity:
     correlate: bool = False
     occlusion_states: str = "each"
     wide_blur: str = "rays"
+    field_tolerance: float = 2e-2
 
     def __post_init__(self) -> None:
         check_choice("propagation", self.propagation, ("exact", "paper"))
@@ -123,6 +127,7 @@ class Fidelity:
         check_choice("occlusion_states", self.occlusion_states, ("each", "mean"))
         check_choice("wide_blur", self.wide_blur, ("rays", "waves"))
         check_positive("pixel_tolerance", self.pixel_tolerance)
+        check_positive("field_tolerance", self.field_tolerance)
         check_positive("layer_spacing", self.layer_spacing, "radians")
         if not 0 < self.enclosed_energy < 1:
             raise ValueError(f"enclosed_energy must be between 0 and 1, got {self.enclosed_energy}")
@@ -177,7 +182,13 @@ class Fidelity:
 PRESETS = {
     "paper": Fidelity("paper", propagation="paper", layers="nearest", stray_light="discard", correlate=True),
     "draft": Fidelity(
-        "draft", pixel_tolerance=1e-1, layers="nearest", enclosed_energy=0.6, max_window=41, occlusion_states="mean"
+        "draft",
+        pixel_tolerance=1e-1,
+        layers="nearest",
+        enclosed_energy=0.6,
+        max_window=41,
+        occlusion_states="mean",
+        field_tolerance=1e-1,
     ),
     "balanced": Fidelity(),
     "reference": Fidelity(
@@ -189,5 +200,6 @@ PRESETS = {
         max_window=257,
         stray_light="veil",
         double=True,
+        field_tolerance=1e-2,
     ),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -11,7 +12,10 @@ from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.pieces import pieces_of
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.render.exposure import render_pieces
 
 _WANTED = [True, False, False, False, False]  # of image, defocus, nodes, PSFs and stray light
 
@@ -74,6 +78,8 @@ class LinearCamera(nn.Module):
         """Return the irradiance A x of linear light x."""
         check_float_tensor("light", light, 4, "(B, C, H, W)")
         self._check("light", light, (self.depth.shape[-2], self.depth.shape[-1]))
+        if self._field is not None:
+            return self._through_lens(light)
         scene, options = self._scene(light.shape[1], light.dtype)
         image = light.to(scene[0].dtype)
         return torch.ops.kornia_tidy.render_layers(image, *scene, *options).to(light.dtype)
@@ -81,12 +87,28 @@ class LinearCamera(nn.Module):
     def adjoint(self, irradiance: Tensor) -> Tensor:
         """Return the transpose of the camera applied to an irradiance y: light of the scene's size."""
         check_float_tensor("irradiance", irradiance, 4, "(B, C, H, W)")
-        scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
-        cut = scene[2].shape[-1] - 1 if self.optics.border == "valid" else 0
+        cut = self.optics.window - 1 if self.optics.border == "valid" else 0
         rows, columns = self.depth.shape[-2:]
         self._check("irradiance", irradiance, (rows - cut, columns - cut))
+        if self._field is not None:
+            return _Transpose.apply(irradiance, self._through_lens, (rows, columns))
+        scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
         plain = [part if part is None else part.detach() for part in scene]
         return _Adjoint.apply(irradiance.to(plain[0].dtype), *plain, *options).to(irradiance.dtype)
+
+    @property
+    def _field(self) -> Field | None:
+        size = self.depth.shape[-2], self.depth.shape[-1]
+        return self.optics.psf_model.field_of(size, self.optics.field_center)
+
+    def _through_lens(self, light: Tensor) -> Tensor:
+        optics, dtype = self.optics, self._dtype(light.dtype)
+        defocus = optics.defocus(self.depth.to(dtype))
+        pieces = pieces_of(optics.psf_model, light.shape[1], dtype, defocus, optics.compositing, field=self._field)
+        return render_pieces(light.to(dtype), defocus, pieces, optics.rendering(light.device)).to(light.dtype)
+
+    def _dtype(self, dtype: torch.dtype) -> torch.dtype:
+        return torch.promote_types(dtype, torch.float64 if self.optics.fidelity.double else torch.float32)
 
     def _check(self, name: str, image: Tensor, size: tuple[int, int]) -> None:
         """Raise unless an image has the size and the batch that the depth map is for."""
@@ -98,7 +120,7 @@ class LinearCamera(nn.Module):
 
     def _scene(self, channels: int, dtype: torch.dtype) -> tuple[list[Any], list[Any]]:
         """Return defocus, nodes, PSFs and stray light, and the options of the renderer."""
-        dtype = torch.promote_types(dtype, torch.float64 if self.optics.fidelity.double else torch.float32)
+        dtype = self._dtype(dtype)
         now = self.optics
         defocus = now.defocus(self.depth.to(dtype))
         bank: PSFBank = now.psf_model.scene_bank(channels, dtype, defocus)
@@ -106,6 +128,21 @@ class LinearCamera(nn.Module):
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
         options = [now.compositing, layers, now.border, fidelity.correlate, "auto"]
         return [defocus, bank.defocus, bank.psfs, bank.veil], options
+
+
+class _Transpose(torch.autograd.Function):
+    """Transpose of a linear function, found by its gradient; its own gradient is the function."""
+
+    @staticmethod
+    def forward(ctx: Any, seen: Tensor, function: Callable[[Tensor], Tensor], size: tuple[int, int]) -> Tensor:
+        ctx.function = function
+        with torch.enable_grad():
+            light = seen.new_zeros(*seen.shape[:2], *size).requires_grad_()
+            return torch.autograd.grad(function(light), light, seen)[0]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        return ctx.function(gradients[0]), None, None
 
 
 class _Adjoint(torch.autograd.Function):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any, NoReturn, Self
+from typing import Any, NoReturn, Self, overload
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_finite
-from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.fidelity import PRESETS, Fidelity
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.modulator.modulator import Timeline
 from kornia_tidy.optics.lens.lens import Lens
@@ -143,24 +143,38 @@ class CameraState(nn.Module):
         self.psf_model = self.psf_model.with_window(None)
         return self.psf_model.fitted.side
 
+    @overload
     def psf_bank(
         self,
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-    ) -> PSFBank:
-        """Return the PSFs of the masks as they are now. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
-        return self.psf_model.psf_bank(channels, dtype, defocus)
+        *,
+        field: None = None,
+    ) -> PSFBank: ...
 
-    def field_bank(
+    @overload
+    def psf_bank(
         self,
-        field: Sequence[tuple[float, float]],
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-    ) -> FieldBank:
-        """Return PSFs at points of the field. See :meth:`kornia_tidy.psf.psf_model.PSFModel.field_bank`."""
-        return self.psf_model.field_bank(field, channels, dtype, defocus)
+        *,
+        field: Sequence[tuple[float, float]],
+    ) -> FieldBank: ...
+
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        field: Sequence[tuple[float, float]] | None = None,
+    ) -> PSFBank | FieldBank:
+        """Return the PSFs of the masks as they are now. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
+        if field is None:
+            return self.psf_model.psf_bank(channels, dtype, defocus)
+        return self.psf_model.psf_bank(channels, dtype, defocus, field=field)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
@@ -246,7 +260,9 @@ class CameraState(nn.Module):
                 check_choice(name, saved[name], tuple(allowed))
         fidelity = saved.get("fidelity")
         if isinstance(fidelity, dict):
-            own = {"wide_blur": Fidelity.wide_blur, **fidelity, "window": saved.get("fixed_window")}
+            preset = PRESETS.get(str(fidelity.get("name")).removesuffix(", changed"), Fidelity())
+            later = {name: getattr(preset, name) for name in ("wide_blur", "field_tolerance")}
+            own = {**later, **fidelity, "window": saved.get("fixed_window")}
             saved = {**saved, "fidelity": own}
         take_over(self, saved, self.settings(), {name: name for name in (*PARTS, "aperture", *OWN_SETTINGS)})
         self.psf_model = self.psf_model.with_window(None)

@@ -269,12 +269,6 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> Tensor:
         extremes = torch.stack([lowest, highest])
         pixels += own.numel()
     camera.notes.clamped = clamped
-    if camera.check_inputs and pixels and camera.psf_model.lens is not None:
-        said = (
-            "the whole picture is rendered through the PSFs of the lens's axis, which differ from those of the field: "
-            "field_bank([...]) shows by how much"
-        )
-        tell_once(camera.notes.told, "field", said, stacklevel=7)
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
         tell_of_defocus(extremes, camera, pixels, int(clamped))
     if fixed is not None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
+from kornia_tidy.psf.field import Field
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.sensor.sensor import STRIP
 
@@ -22,6 +23,7 @@ class Strip:
         border: what lies beyond the image: ``"valid"`` where it reaches as far as the PSFs.
         rows: of the capture. Default: all.
         reach: lowest and highest defocus of all rows, (2,). Default: to be found.
+        field: of the whole picture, behind a real lens, and where in it this image begins.
     """
 
     image: Tensor
@@ -29,6 +31,7 @@ class Strip:
     border: str
     rows: slice | None = None
     reach: Tensor | None = None
+    field: Field | None = None
 
 
 def rows_at_once(sample: Sample, allowed: int) -> int | None:
@@ -46,7 +49,9 @@ def rows_at_once(sample: Sample, allowed: int) -> int | None:
     return None if rows >= height else rows
 
 
-def strips_of(sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor) -> Iterator[Strip]:
+def strips_of(
+    sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor, field: Field | None
+) -> Iterator[Strip]:
     """Yield the strips of a capture.
 
     Args:
@@ -56,13 +61,16 @@ def strips_of(sample: Sample, rows: int, height: int, radius: int, border: str, 
         radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
         border: of the capture.
         reach: lowest and highest defocus, (2,).
+        field: of the picture, behind a real lens.
     """
     sides = "replicate" if border == "zero" else border  # black has no depth of its own
     for top in range(0, height, rows):
         own = slice(top, min(top + rows, height))
         image = padded_band(sample.image, own, radius, border).to(sample.dtype)
         depth = padded_band(sample.depth, own, radius, sides).to(sample.dtype)
-        yield Strip(image, depth, "valid", own, reach)
+        before = 0 if border == "valid" else radius
+        place = None if field is None else field.moved(top - before, -before)
+        yield Strip(image, depth, "valid", own, reach, place)
 
 
 def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:

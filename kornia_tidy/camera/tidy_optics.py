@@ -87,8 +87,9 @@ class TiDyOptics(CameraState):
             is not part of the state.
         lens: a :class:`~kornia_tidy.optics.Lens` in whose stop the masks stand, or the name of one, such as
             ``"double-gauss-50mm"``, made for the camera's aperture and focus. Its focal length, f-number and focus are
-            the camera's. Captures see the PSFs of its axis; :meth:`psf_bank` has those of the field. Default: an ideal
-            lens.
+            the camera's. Each pixel sees the PSF of its place in the picture, within the fidelity's
+            ``field_tolerance``; :meth:`psf_bank` gives those of single places. Default: an ideal lens.
+        field_center: where the middle of the pictures lies, y and x in sensor pixels from the lens's axis: of crops.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -147,6 +148,7 @@ class TiDyOptics(CameraState):
         memory_budget: int = 512 << 20,
         holes: str = "error",
         lens: Lens | str | None = None,
+        field_center: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         check_positive("memory_budget", memory_budget, "bytes")
         fidelity = Fidelity.of(fidelity)
@@ -176,6 +178,7 @@ class TiDyOptics(CameraState):
         self.check_inputs = check_inputs
         self.holes = holes
         self.memory_budget = memory_budget
+        self.field_center = field_center
         self.notes = Notes()  # shared with cameras made by _replace
 
     @classmethod
@@ -247,7 +250,7 @@ class TiDyOptics(CameraState):
             scene = strip.image, strip.depth, defocus
             reach = survey_unread(*scene, self) if Mode.UNREAD in torch_mode() else survey_defocus([defocus], self)
         given = self.compositing, self.memory_budget, defocus, light.device
-        pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given)
+        pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given, strip.field)
         return render_pieces(light, defocus, pieces, self.rendering(light.device, strip.border))
 
     def strips(self, sample: Sample) -> Iterator[Strip]:
@@ -257,15 +260,18 @@ class TiDyOptics(CameraState):
             sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
         """
         rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
+        field, size = None, (sample.image.shape[-2], sample.image.shape[-1])
+        if self.lens is not None:
+            field = self.psf_model.field_of(size, self.field_center)
         if rows is None:
-            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border)
+            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border, field=field)
             return
         check_border(self.border, *sample.image.shape[-2:], self.window)
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
         reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self)
-        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach)
+        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach, field)
 
     def irradiance(self, sample: Sample) -> Tensor:
         """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""

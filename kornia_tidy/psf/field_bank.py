@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,8 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_psfs
+from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_psfs, turned_lenses
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 from kornia_tidy.runtime.default_device import on_cpu
@@ -30,6 +32,7 @@ class FieldBank:
         field: (F, 2) points of the field, y and x in sensor pixels from the axis.
         energy: (F, D, C) share of the point's light inside the window, before anything is done about the rest.
         light: (F, D, C) relative illumination: light of an even scene over that on the axis.
+        veil: (F, D, C) light that the renderer spreads evenly over the image, or None for none.
 
     Convention:
         - PSFs sum to ``energy * light``, so that vignetting stays; after ``with_stray_light("renormalize")`` to
@@ -38,7 +41,7 @@ class FieldBank:
     Example:
         >>> from kornia_tidy.psf import PSFModel
         >>> model = PSFModel(lens="single-50mm", fidelity="draft")
-        >>> bank = model.field_bank([(0.0, 0.0), (550.0, 630.0)], defocus=[0.0])
+        >>> bank = model.psf_bank(defocus=[0.0], field=[(0.0, 0.0), (550.0, 630.0)])
         >>> bank.psfs.shape[:3], round(float(bank.light[1, 0, 1]), 2)
         (torch.Size([2, 1, 3]), 0.97)
     """
@@ -48,6 +51,7 @@ class FieldBank:
     field: Tensor
     energy: Tensor
     light: Tensor
+    veil: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.psfs.shape)
@@ -69,6 +73,22 @@ class FieldBank:
     def at(self, index: int) -> PSFBank:
         """Return the bank of one point of the field; its PSFs keep the light that they have there."""
         return PSFBank(self.psfs[index], self.defocus, self.energy[index])
+
+    def between(self, field: Field, pixel: tuple[float, float]) -> PSFBank:
+        """Return the PSFs at a pixel of the picture whose field this bank has the nodes of.
+
+        Args:
+            field: where the nodes stand.
+            pixel: row and column in the picture.
+        """
+        rows, columns = (field.along(axis, torch.tensor([float(pixel[axis])]))[0] for axis in (0, 1))
+        weights = (rows.T * columns).flatten()
+
+        def mixed(values: Tensor) -> Tensor:
+            return torch.tensordot(weights.to(values), values, 1)
+
+        veil = None if self.veil is None else mixed(self.veil)
+        return PSFBank(mixed(self.psfs), self.defocus, mixed(self.energy), veil)
 
     def with_stray_light(self, kind: str) -> FieldBank:
         """Return a bank in which the light outside the window is dealt with.
@@ -144,25 +164,52 @@ def field_psf_bank(
     sensor = Sensor(pixel_pitch, window, min(max(tolerance / 10, _LEAST), _MOST))
     apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
-    stop = weights, pupil.transmission, lens
-    psfs, light = [], []
-    for point, shifts in zip(field, apart, strict=True):
-        metres = (point[0] * pixel_pitch, point[1] * pixel_pitch)
-        total: Tensor | float = 0.0
-        lit: Tensor | float = 0.0
-        for w, wavelength in enumerate(spectrum.wavelengths):
-            seen, mixing = _mixing(spectrum, w, phase)
-            if seen:
-                given = metres, defocus, wavelength, sensor, shifts[w, seen].tolist()
-                energies, share = lens_psfs(screens[w], *stop, *given)
-                total = total + torch.einsum("pv,d,dvyx->dpyx", mixing, share, energies)
-                lit = lit + torch.einsum("pv,d->dp", mixing, share)
-        psfs.append(total)
-        light.append(lit)
-    whole, there = torch.stack(psfs), torch.stack(light)
-    energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
+    metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
+    psfs: list[Any] = [0.0] * len(field)
+    light: list[Any] = [0.0] * len(field)
+    for w, wavelength in enumerate(spectrum.wavelengths):
+        seen, mixing = _mixing(spectrum, w, phase)
+        if not seen:
+            continue
+        axis, *turned = turned_lenses(lens, metres, defocus, wavelength)
+        on_axis = lens_light(whole_cells(pupil), pupil.transmission, axis, sensor.tolerance).to(weights)
+        for f, (there, shifts) in enumerate(zip(turned, apart, strict=True)):
+            shown = weights, pupil.transmission, there, sensor
+            energies, area = lens_psfs(screens[w], *shown, shifts[w, seen].tolist())
+            share = area / on_axis
+            psfs[f] = psfs[f] + torch.einsum("pv,d,dvyx->dpyx", mixing, share, energies)
+            light[f] = light[f] + torch.einsum("pv,d->dp", mixing, share)
+    whole, lit = torch.stack(psfs), torch.stack(light)
+    energy = whole.sum((-2, -1)) / torch.where(lit == 0, torch.ones_like(lit), lit)
     points = phase.new_tensor([list(point) for point in field])
-    return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
+    return FieldBank(whole, phase.new_tensor(defocus), points, energy, lit)
+
+
+def field_light(
+    pupil: Pupil,
+    spectrum: Spectrum,
+    defocus: Sequence[float],
+    field: Sequence[tuple[float, float]],
+    lens: Lens,
+    pixel_pitch: float,
+) -> Tensor:
+    """Return the light of an even scene at points of the field over that on the axis, (F, D, C) float64.
+
+    Args:
+        pupil: this and the other arguments are those of :func:`field_psf_bank`.
+        spectrum: as there.
+        defocus: as there.
+        field: as there.
+        lens: as there.
+        pixel_pitch: as there.
+    """
+    spans, found = whole_cells(pupil), []
+    metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
+    for wavelength in spectrum.wavelengths:
+        turned = turned_lenses(lens, metres, defocus, wavelength)
+        areas = torch.stack([lens_light(spans, pupil.transmission, there) for there in turned])
+        found.append(areas[1:] / areas[0])
+    return torch.stack(found, -1) @ areas.new_tensor(spectrum.channel_weights).T
 
 
 def _mixing(spectrum: Spectrum, wave: int, like: Tensor) -> tuple[list[int], Tensor]:
@@ -174,12 +221,18 @@ def _mixing(spectrum: Spectrum, wave: int, like: Tensor) -> tuple[list[int], Ten
     return seen, like.new_tensor(rows)
 
 
+def whole_cells(pupil: Pupil) -> Tensor:
+    """Return begin and end of the cells of a mask along either axis in stop radii, (2, N) float64."""
+    cells = pupil.amplitude.shape[-1]
+    begin = torch.arange(cells, dtype=torch.float64) - cells / 2
+    return torch.stack([begin, begin + 1]) * pupil.cell_pitch
+
+
 def _screens(phase: Tensor, pupil: Pupil, dispersion: float) -> list[Screen]:
     """Return the fields in the stop: of whole cells, or of what a mask with gaps changes and of the rest."""
     cells = pupil.amplitude.shape[-1]
     waves = pupil_field(phase, pupil.amplitude, dispersion)
-    begin = torch.arange(cells, dtype=torch.float64) - cells / 2
-    whole = torch.stack([begin, begin + 1]) * pupil.cell_pitch
+    whole = whole_cells(pupil)
     if pupil.fill_factor == 1:
         return [Screen(waves, whole)]
     active = gapped_cells(cells, cells // phase.shape[-1], pupil.fill_factor)[:, :cells] * pupil.cell_pitch

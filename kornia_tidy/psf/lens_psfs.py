@@ -51,10 +51,7 @@ def lens_psfs(
     screens: Sequence[Screen],
     weights: Tensor,
     transmission: Tensor,
-    lens: Lens,
-    field: tuple[float, float],
-    defocus: Sequence[float],
-    wavelength: float,
+    turned: TurnedLens,
     sensor: Sensor,
     shifts: Sequence[tuple[float, float]] = ((0.0, 0.0),),
 ) -> tuple[Tensor, Tensor]:
@@ -69,20 +66,15 @@ def lens_psfs(
         screens: fields in the stop, which add up.
         weights: share of the exposure of each state, (K,).
         transmission: of light by the cells of the last screen, (N, N) float64.
-        lens: in front of the sensor.
-        field: the point's place (y, x) on the sensor in metres from the axis.
-        defocus: radians at 530 nm, (D,).
-        wavelength: in metres.
+        turned: the lens at the field point, see :func:`turned_lenses`.
         sensor: pixels, window and tolerance.
         shifts: of the light along y and x in pixels, one for each copy of the PSFs.
 
     Returns:
-        Share of the light in each pixel, (D, V, P, P), and the light of an even scene over that on the axis, (D,).
+        Share of the light in each pixel, (D, V, P, P), and the area of direction cosines that an even scene fills,
+        (D,): see :func:`lens_light`.
     """
-    height, azimuth = math.hypot(*field), math.atan2(*field)
-    psi = torch.tensor(defocus, dtype=torch.float64)
-    sample = lens.sample(torch.tensor([0.0, height], dtype=torch.float64), psi, wavelength)
-    axis, turned = (_Turned(sample, f, angle, psi, wavelength) for f, angle in ((0, 0.0), (1, azimuth)))
+    wavelength = turned.wavelength
     steepest, complex_dtype = turned.steepest(sensor), screens[0].waves.dtype
     widest = max(float((screen.spans[1] - screen.spans[0]).max()) for screen in screens)
     stops = [_stop(turned, screen.spans, steepest * widest / 2, sensor.tolerance) for screen in screens]
@@ -92,9 +84,7 @@ def lens_psfs(
     settings = sensor.window, sensor.tolerance, weights.dtype
     columns = scattered_axis(columns, *settings, [shift[1] for shift in shifts])
     rows = scattered_axis(rows, *settings, [shift[0] for shift in shifts])
-    still = _stop(axis, screens[-1].spans, 0.0, sensor.tolerance)
     passed, area = turned.light(*stops[-1], transmission)
-    _, area_on_axis = axis.light(*still, transmission)
     amplitude = torch.cat([turned.amplitude(*stop) for stop in stops], 1)
     amplitude = amplitude * (sensor.pitch / wavelength / passed.sqrt())[:, None, None]
     phase = torch.cat([turned.phase(stop) for stop in stops], 1)
@@ -103,13 +93,43 @@ def lens_psfs(
     chosen = [(p.row.to(device), p.column.to(device)) for p in points]
     cells = torch.cat([s.waves[:, row, column] for s, (row, column) in zip(screens, chosen, strict=True)], 1)
     energies = scattered_energies(cells, weights, patches, rows.to(device), columns.to(device))
-    return energies, (area / area_on_axis).to(weights)
+    return energies, area.to(weights)
+
+
+@on_cpu
+def lens_light(spans: Tensor, transmission: Tensor, turned: TurnedLens, tolerance: float = 1e-4) -> Tensor:
+    """Return the area of direction cosines that an even scene fills at a field point, (D,) float64: its irradiance.
+
+    Args:
+        spans: begin and end of the mask's cells along either axis in stop radii, (2, N) float64.
+        transmission: of light by the cells, (N, N).
+        turned: the lens at the field point.
+        tolerance: of the area.
+    """
+    return turned.light(*_stop(turned, spans, 0.0, tolerance), transmission)[1]
+
+
+@on_cpu
+def turned_lenses(
+    lens: Lens, field: Sequence[tuple[float, float]], defocus: Sequence[float], wavelength: float
+) -> list[TurnedLens]:
+    """Return a lens as it is seen from points of the field.
+
+    Args:
+        lens: in front of the sensor.
+        field: places (y, x) on the sensor in metres from the axis.
+        defocus: radians at 530 nm, (D,).
+        wavelength: in metres.
+    """
+    psi = torch.tensor(defocus, dtype=torch.float64)
+    sample = lens.sample(torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64), psi, wavelength)
+    return [TurnedLens(sample, index, math.atan2(*point), psi, wavelength) for index, point in enumerate(field)]
 
 
 Stop = tuple[StopQuadrature, Tensor]  # points in patches, (C, S), and polynomials there, (J, C, S)
 
 
-def _stop(turned: _Turned, spans: Tensor, half: float, tolerance: float) -> Stop:
+def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:
     """Return the open stop cell by cell, as finely as the phase asks, which changes by so much over half a cell."""
     parts = max(1, math.ceil(half / _LONGEST))
     order = max(4, gauss_legendre_order(half / parts, tolerance))
@@ -131,11 +151,11 @@ def _stop_points(
         return points, zernike_polynomials((degree + 1) * (degree + 2) // 2, points.y, points.x)
 
 
-class _Turned:
+class TurnedLens:
     """A lens at one field point of a sample, in the coordinates of the mask and of the sensor."""
 
     def __init__(self, sample: LensSample, index: int, azimuth: float, psi: Tensor, wavelength: float) -> None:
-        self.psi, self.azimuth = psi, azimuth
+        self.psi, self.azimuth, self.wavelength = psi, azimuth, wavelength
         self.scale = REFERENCE_WAVELENGTH / wavelength
         self.edges = sample.edges[index]
         sines = {"tangential"}

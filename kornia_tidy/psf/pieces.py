@@ -20,6 +20,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.window_sides import next_fast_size
+from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.psf.psf_model import PSFModel
@@ -40,20 +42,23 @@ class Piece:
     """The PSFs of a part of a capture.
 
     Args:
-        bank: computes the PSFs, or finds them in a memory.
+        bank: computes the PSFs, or finds them in a memory; a :class:`~kornia_tidy.psf.field_bank.FieldBank` where there
+            is a field.
         share: of the exposure; (S,) where the bank holds the PSFs of S states, those of a state after each other.
         span: defocus in radians from the first to below the second whose pixels are the piece's; None for all.
         grid: sensor pixels along a side of a pixel of the PSFs.
         window: side in sensor pixels that holds the PSFs of all pieces, where they differ: a border ``"valid"`` crops
             by it.
+        field: where over the picture its PSFs are known; None for PSFs that are the same everywhere.
         keep: False for PSFs that are made for each use, and once more in the backward pass.
     """
 
-    bank: Callable[[], PSFBank]
+    bank: Callable[[], PSFBank | FieldBank]
     share: Tensor | float = 1.0
     span: tuple[float, float] | None = None
     grid: int = 1
     window: int | None = None
+    field: Field | None = None
     keep: bool = True
 
     def holds(self, defocus: Tensor) -> Tensor:
@@ -72,6 +77,7 @@ def pieces_of(
     budget: int | None = None,
     scene: Tensor | None = None,
     device: torch.device | None = None,
+    field: Field | None = None,
 ) -> Iterator[Piece]:
     """Yield what a capture is a sum over: one piece in the ordinary case.
 
@@ -86,6 +92,7 @@ def pieces_of(
             defocus come as a whole in any case, and so do all on accelerators and in compiled code.
         scene: the map, where it is at hand: of depths between that it does not hold, some are left out.
         device: of measured PSFs. Default: that of ``reach``.
+        field: of the picture, behind a real lens.
 
     Raises:
         ValueError: if blur is so wide that scatter or occlusion would need more than the budget.
@@ -102,27 +109,31 @@ def pieces_of(
             return
         _check_wide_bytes(blur, channels, dtype, compositing, budget)
     most, remembered = None, True
+    points = 1 if field is None else len(field.points)
     if blur is None and budget is not None and not torch_mode():
         side = max(model.fidelity.window or model.fidelity.max_window, model.fitted.side)
-        if _MOST_COPIES * channels * dtype.itemsize * len(model.defocus_nodes) * side**2 > budget // 2:
-            most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget)
+        if _MOST_COPIES * channels * dtype.itemsize * len(model.defocus_nodes) * side**2 * points > budget // 2:
+            most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget, points)
     source = model if remembered else model.without_memory()
-    make = partial(PSFModel.scene_bank, channels=channels, dtype=dtype, device=device or reach.device)
+    make: Callable[..., Any] = PSFModel.scene_bank if field is None else PSFModel.scene_field_bank
+    where = {"device": device or reach.device} if field is None else {"field": field}
+    make = partial(make, channels=channels, dtype=dtype, **where)
     if compositing == "occlusion" and (blur is not None or model.measured_cut):  # discs of rays end
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
-        if Mode.UNREAD in torch_mode():  # all states in one bank, for one rendering
+        if Mode.UNREAD in torch_mode() and field is None:  # all states in one bank, for one rendering
             yield Piece(partial(make, source, defocus=reach, each_state=True), shares)
             return
         for state, share in enumerate(shares):
-            yield Piece(partial(make, source.of_state(state), defocus=reach), share, keep=most is None)
+            one = partial(make, source.of_state(state), defocus=reach)
+            yield Piece(one, share, field=field, keep=most is None)
     elif most is None:
-        yield Piece(partial(make, source, defocus=reach))
+        yield Piece(partial(make, source, defocus=reach), field=field)
     else:
         for span in _runs(model.defocus_nodes, scene, most - 1):
-            ends = torch.tensor(span, dtype=torch.float64)
-            yield Piece(partial(make, source, defocus=ends), span=_open_ended(span, model.defocus_nodes), keep=False)
+            own, ends = partial(make, source, defocus=torch.tensor(span, dtype=torch.float64)), model.defocus_nodes
+            yield Piece(own, span=_open_ended(span, ends), field=field, keep=False)
 
 
 def comes_in_pieces(model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int) -> bool:
@@ -166,7 +177,7 @@ def runs_of(present: list[bool], most: int) -> list[tuple[int, int]]:
 
 
 def _most_layers(
-    model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, compositing: str, budget: int
+    model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, compositing: str, budget: int, points: int = 1
 ) -> tuple[int | None, bool]:
     """Return the most layers of a piece, None where all fit at once, and whether PSFs are remembered."""
     whole, fidelity = (None, True), model.fidelity
@@ -175,6 +186,7 @@ def _most_layers(
     if fidelity.layers not in ("nearest", "linear") or (layers := len(nodes_around(model.defocus_nodes, reach))) < 3:
         return whole
     psfs, work = layer_bytes(model, channels, dtype)
+    psfs *= points
     allowed = max(budget // 2, LEAST_BYTES)
     if compositing == "occlusion":
         states = len(model.state_weights(dtype)) if fidelity.occlusion_states == "each" else 1
@@ -184,7 +196,7 @@ def _most_layers(
     return max(2, allowed // (psfs + work)), layers * psfs <= allowed
 
 
-def _with_tails(make: Callable[..., PSFBank], *given: Any, **options: Any) -> PSFBank:
+def _with_tails(make: Callable[..., Any], *given: Any, **options: Any) -> PSFBank:
     return make(*given, **options).with_tails()
 
 

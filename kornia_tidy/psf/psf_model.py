@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor
-from typing import Any, NoReturn, Self, cast
+from typing import Any, NoReturn, Self, cast, overload
 
 import numpy as np
 import torch
@@ -30,7 +30,9 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
 )
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.field_bank import FieldBank, check_field, field_psf_bank
+from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.field_bank import FieldBank, check_field, field_light, field_psf_bank
+from kornia_tidy.psf.field_nodes import field_nodes
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
@@ -45,6 +47,9 @@ from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur,
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
+Points = tuple[tuple[float, float], ...]
+AXIS: Points = ((0.0, 0.0),)
+MOST_FIELDS = 8  # sizes of pictures whose nodes are remembered
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
@@ -56,6 +61,9 @@ class Derived:
         self.pupil: Pupil | None = None
         self.blur: WideBlur | None = None
         self.blur_known = False
+        self.fields: dict[tuple[tuple[int, int], tuple[float, float]], Field] = {}
+        self.light: tuple[object, Tensor] | None = None  # over the field, and what for
+        self.lit: tuple[PSFBank, FieldBank] | None = None  # the last PSFs, and the same with their light
 
 
 class PSFModel:
@@ -104,8 +112,9 @@ class PSFModel:
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _derived: Derived
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
-    # For each moment and state, for their averages, for each number of threads and each grid; None remembers no PSFs.
-    _memories: dict[tuple[int | None, int | None, int, int], BankMemory] | None
+    # For each moment and state, for their averages, for each number of threads, grid and points of the field; None
+    # remembers no PSFs.
+    _memories: dict[tuple[int | None, int | None, int, int, Points], BankMemory] | None
 
     def __init__(
         self,
@@ -186,12 +195,34 @@ class PSFModel:
 
     # ------------------------------------------------------------------ PSFs
 
+    @overload
     def psf_bank(
         self,
         channels: int | None = None,
         dtype: torch.dtype | None = None,
         defocus: Sequence[float] | None = None,
-    ) -> PSFBank:
+        *,
+        field: None = None,
+    ) -> PSFBank: ...
+
+    @overload
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        field: Sequence[tuple[float, float]],
+    ) -> FieldBank: ...
+
+    def psf_bank(
+        self,
+        channels: int | None = None,
+        dtype: torch.dtype | None = None,
+        defocus: Sequence[float] | None = None,
+        *,
+        field: Sequence[tuple[float, float]] | None = None,
+    ) -> PSFBank | FieldBank:
         """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
@@ -202,40 +233,25 @@ class PSFModel:
             channels: 1 for an image of one channel, which is taken at 530 nm. Default: those of the spectrum.
             dtype: float32 or float64. Default: float32, or float64 where the fidelity asks for it.
             defocus: ascending nodes in radians. Default: all of ``defocus_nodes``.
+            field: points (y, x) in sensor pixels from the axis, of cameras with a lens: (F, D, C, P, P). Default: the
+                axis.
+
+        Raises:
+            TypeError: if the field is not numbers.
+            ValueError: if field points are given without a lens, or are not one or more finite points.
         """
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = self.bank_dtype(dtype)
+        if field is not None:
+            points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
+            nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+            found = self._lens_psfs(spectrum.flat(), *self.states(dtype), nodes, self.window, points, tolerance)
+            return found.with_stray_light(self.fidelity.stray_light)
         if self.measured is not None:
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
         return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
-
-    def field_bank(
-        self,
-        field: Sequence[tuple[float, float]],
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-    ) -> FieldBank:
-        """Return the PSFs of :meth:`psf_bank` at points of the field, of a camera with a lens: (F, D, C, P, P).
-
-        Args:
-            field: points (y, x) in sensor pixels from the axis.
-            channels: as there.
-            dtype: as there.
-            defocus: as there.
-
-        Raises:
-            TypeError: if the field is not numbers.
-            ValueError: if there is no lens, or the field is not one or more finite points.
-        """
-        points = check_field(field, self.lens)
-        spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels).flat()
-        nodes, tolerance = self.defocus_nodes if defocus is None else tuple(defocus), self.fidelity.pixel_tolerance
-        shown = self.states(self.bank_dtype(dtype))
-        bank = self._lens_psfs(spectrum, *shown, nodes, self.window, points, tolerance)
-        return bank.with_stray_light(self.fidelity.stray_light)
 
     def _lens_psfs(
         self,
@@ -264,6 +280,7 @@ class PSFModel:
         *,
         each_state: bool = False,
         device: torch.device | None = None,
+        points: Points = AXIS,
     ) -> PSFBank:
         """Return the PSFs that a scene needs; of depths it does not hold there are none.
 
@@ -276,6 +293,8 @@ class PSFModel:
             defocus: the scene's defocus in radians, any shape.
             each_state: the PSFs of each state of the exposure in one bank, (D, S C, P, P), and not their average.
             device: of measured PSFs. Default: that of ``defocus``.
+            points: of the field, y and x in sensor pixels from the axis: (D, F C, P, P), those of a point follow each
+                other, and each PSF has the light that an ideal lens would give it. See :meth:`scene_field_bank`.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
@@ -283,15 +302,59 @@ class PSFModel:
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         if kind in ("nearest", "linear"):
-            return self._computed_bank(spectrum, dtype, nodes_around(nodes, defocus), each_state, stray_light)
+            held = nodes_around(nodes, defocus)
+            return self._computed_bank(spectrum, dtype, held, each_state, stray_light, points=points)
         targets = nodes_around(fine_nodes(nodes), defocus)
         spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
         first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
         last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
         samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
-        bank = self._computed_bank(spectrum, dtype, samples, each_state)
+        bank = self._computed_bank(spectrum, dtype, samples, each_state, points=points)
         band = self._band() if kind == "bandlimited" else None
         return interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
+
+    def scene_field_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, field: Field) -> FieldBank:
+        """Return the PSFs that a scene needs at the nodes of a field, see :meth:`scene_bank`.
+
+        Args:
+            channels: of the image: those of the spectrum, or 1.
+            dtype: float32 or float64.
+            defocus: the scene's defocus in radians, any shape.
+            field: of the picture.
+        """
+        bank, derived = self.scene_bank(channels, dtype, defocus, points=field.points), self._derived
+        if (known := derived.lit) is None or known[0] is not bank:
+            asked = bank.defocus.tolist(), field.points, channels
+            if derived.light is None or derived.light[0] != asked:
+                given = self.pupil, self.spectrum_of(channels).flat(), *asked[:2], cast("Lens", self.lens)
+                derived.light = asked, field_light(*given, self.camera.pixel_pitch)
+            light = derived.light[1].to(bank.psfs)
+            light = light.repeat_interleave(bank.psfs.shape[1] // light[:, 0].numel(), 2)
+            each, within = (-1, light.shape[-1]), light.movedim(1, 0)
+            psfs = bank.psfs.unflatten(1, each) * within[..., None, None]
+            veil = None if bank.veil is None else (bank.veil.unflatten(1, each) * within).movedim(1, 0)
+            energy, places = bank.energy.unflatten(1, each).movedim(1, 0), bank.psfs.new_tensor(field.points)
+            known = bank, FieldBank(psfs.movedim(1, 0), bank.defocus, places, energy, light, veil)
+            derived.lit = None if psfs.requires_grad else known
+        return known[1]
+
+    def field_of(self, size: tuple[int, int], center: tuple[float, float] = (0.0, 0.0)) -> Field | None:
+        """Return where over a picture PSFs are to be known for the fidelity's tolerance; None for an ideal lens.
+
+        Args:
+            size: rows and columns of the picture.
+            center: of the picture, y and x in sensor pixels from the lens's axis.
+        """
+        if self.lens is None or self.measured is not None:
+            return None
+        known = self._derived.fields
+        if (size, center) not in known:
+            reach, wavelength = self.window / 4, min(self._sampled.wavelengths)
+            given = self.camera.defocus_range, wavelength, self.camera.pixel_pitch, reach
+            known[size, center] = field_nodes(size, center, self.lens, *given, self.fidelity.field_tolerance)
+            if len(known) > MOST_FIELDS:
+                known.pop(next(iter(known)))
+        return known[size, center]
 
     def group_bank(
         self, channels: int, dtype: torch.dtype, group: BlurGroup, nodes: tuple[float, ...] | None = None
@@ -317,6 +380,7 @@ class PSFModel:
         each_state: bool = False,
         stray_light: tuple[str, int] | None = None,
         group: BlurGroup | None = None,
+        points: Points = AXIS,
     ) -> PSFBank:
         """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
         states, weights = self.states(dtype)
@@ -329,7 +393,7 @@ class PSFModel:
         if isinstance(self.aperture, LearnableAperture):
             amplitude = self.pupil.amplitude.to(weights)
             learning, compared = learning or amplitude.requires_grad, torch.cat([weights, amplitude.flatten()])
-        exact = partial(self._exact_psfs, spectrum, grid)
+        exact = partial(self._exact_psfs, spectrum, grid, points=points)
         build = partial(exact, states, weights, window=side, each_state=each_state)
         if (blur := self.wide_blur) is not None and not traced and not each_state:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
@@ -348,7 +412,9 @@ class PSFModel:
         setting += [None if self.lens is None else self.lens.table]
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, self.state, torch.get_num_threads(), grid
+        key = self.moment, self.state, torch.get_num_threads(), grid, points
+        if points != AXIS:  # of one picture at a time
+            memories.update({other: BankMemory() for other in memories if other[-1] not in (AXIS, points)})
         memory = memories.get(key) or memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, compared, nodes, build, stray_light)
 
@@ -363,6 +429,7 @@ class PSFModel:
         *,
         each_state: bool = False,
         tolerance: float | None = None,
+        points: Points = AXIS,
     ) -> PSFBank:
         pupil = self.pupil
         if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
@@ -374,7 +441,6 @@ class PSFModel:
         dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
         shift = [self.camera.chromatic_defocus(wavelength) for wavelength in spectrum.wavelengths]
         if self.lens is not None:
-            points = [(0.0, 0.0)]
             shown = zip(states[:, None], torch.ones_like(weights), strict=True) if each_state else [(states, weights)]
             banks = [
                 self._lens_psfs(
@@ -382,8 +448,10 @@ class PSFModel:
                 )
                 for own, share in shown
             ]
-            psfs, energy = (torch.cat([getattr(bank, name)[0] for bank in banks], 1) for name in ("psfs", "energy"))
-            return PSFBank(psfs, states.new_tensor(nodes), energy)
+            light = torch.where(banks[0].light == 0, 1, banks[0].light)
+            psfs = [(bank.psfs / light[..., None, None]).movedim(0, 1).flatten(1, 2) for bank in banks]
+            energy = [bank.energy.movedim(0, 1).flatten(1, 2) for bank in banks]
+            return PSFBank(torch.cat(psfs, 1), states.new_tensor(nodes), torch.cat(energy, 1))
         if self.fidelity.propagation == "paper":
             if pupil.fill_factor != 1:
                 raise ValueError(
@@ -719,6 +787,8 @@ class PSFModel:
         fidelity.pop("window")  # the window has an entry of its own
         if fidelity["wide_blur"] == Fidelity.wide_blur:  # states of earlier versions do not have it
             fidelity.pop("wide_blur")
+        if self.lens is None:  # nor this
+            fidelity.pop("field_tolerance")
         bank = self.measured
         return {
             **{name: settings_of(getattr(self, name)) for name in ("masks", "camera", "modulator", "spectrum")},

@@ -149,9 +149,14 @@ def _spread(at: Tensor, width: int) -> Tensor:
     return torch.where(at.abs() <= 1, torch.exp(_shape(width) * (inside.sqrt() - 1)), 0.0)
 
 
+@lru_cache(maxsize=4)
+def _legendre(order: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(order)
+
+
 def _spread_transform(frequency: np.ndarray, width: int) -> np.ndarray:
     """Return the Fourier transform of the kernel, frequency in cycles per sample."""
-    nodes, weights = np.polynomial.legendre.leggauss(2 * _NODES)
+    nodes, weights = _legendre(2 * _NODES)
     values = weights * np.exp(_shape(width) * (np.sqrt(1 - nodes**2) - 1)) * width / 2
     return np.cos(math.pi * width * frequency[:, None] * nodes) @ values
 

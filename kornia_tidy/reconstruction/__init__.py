@@ -16,6 +16,7 @@ from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.residual import Residual
+from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.self_ensemble import SelfEnsemble, self_ensemble
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
 from kornia_tidy.reconstruction.tiled import reconstruct_tiled
@@ -46,5 +47,6 @@ __all__ = [
     "load_midas_small",
     "receptive_field",
     "reconstruct_tiled",
+    "restored_over_field",
     "self_ensemble",
 ]

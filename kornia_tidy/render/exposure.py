@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
-from kornia_tidy.render.render_ops import render_layers
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """How pieces are rendered.
-
-    Args:
-        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        border: what lies beyond the image.
-        layers: ``"nearest"`` or ``"linear"``: how pixels between two layers take part in them.
-        correlate: whether PSFs are flipped by 180 degrees.
-        method: the backend, see :func:`kornia_tidy.render.compositing.render`.
-    """
-
-    compositing: str
-    border: str
-    layers: str = "linear"
-    correlate: bool = False
-    method: str = "auto"
+from kornia_tidy.render.over_field import render_over_field
+from kornia_tidy.render.render_ops import Rendering, render_layers
 
 
 def render_pieces(light: Tensor, defocus: Tensor, pieces: Iterable[Piece], rendering: Rendering) -> Tensor:
@@ -88,10 +71,13 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
         inside = piece.holds(defocus)
         defocus = torch.where(inside, defocus, bank.defocus[0].to(defocus))  # a layer that is there costs least
         light = light if gathers else light * inside
-    planes = bank.psfs.shape[1] // light.shape[1]  # of the scene's colours, where these have spectra, or of states
+    planes = bank.psfs.shape[-3] // light.shape[1]  # of the scene's colours, where these have spectra, or of states
     if planes > 1:
         light = light.repeat(1, planes, 1, 1)
-    seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, **asdict(rendering))
+    if piece.field is not None and isinstance(bank, FieldBank):
+        seen = render_over_field(light, defocus, bank, piece.field, rendering)
+    else:
+        seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, **asdict(rendering))
     if inside is not None and gathers:
         seen = torch.where(cropped(inside, margin), seen, 0)
     if isinstance(piece.share, Tensor) and piece.share.ndim:

@@ -8,6 +8,7 @@ arguments are kept between the two.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -30,6 +31,25 @@ _TENSORS = 5  # of a scene, which may have gradients
 
 torch.library.define("kornia_tidy::render_layers", f"({_SCENE}) -> Tensor")
 torch.library.define("kornia_tidy::render_layers_gradients", f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]")
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How a scene is rendered.
+
+    Args:
+        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
+        border: what lies beyond the image.
+        layers: ``"nearest"`` or ``"linear"``: how pixels between two layers take part in them.
+        correlate: whether PSFs are flipped by 180 degrees.
+        method: the backend, see :func:`render_layers`.
+    """
+
+    compositing: str
+    border: str
+    layers: str = "linear"
+    correlate: bool = False
+    method: str = "auto"
 
 
 def render_layers(

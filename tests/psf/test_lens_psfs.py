@@ -16,7 +16,6 @@ from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf import FieldBank, PSFModel, Pupil
 from kornia_tidy.psf.field_bank import field_psf_bank
-from kornia_tidy.render.compositing import render
 from tests.base import BaseTester, shared
 from tests.optics.lens.lenses import symmetric_pair
 
@@ -71,7 +70,7 @@ class TestLensPSFs(BaseTester):
         """Point by point on a fine sensor, where a pixel is the value at its centre to a part in ten thousand."""
         lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=6e-3)
         masks, pitch = random_mask(), 0.5e-6
-        found = model(lens, masks, pitch).field_bank([tuple(16 * f for f in field)], defocus=[7.0])
+        found = model(lens, masks, pitch).psf_bank(defocus=[7.0], field=[tuple(16 * f for f in field)])
         expected = huygens(lens, masks.phase[0].detach(), tuple(16 * f for f in field), 7.0, pitch, 21)
         psf = found.psfs[0, 0, 0].detach() / found.light[0, 0, 0]
         # The even grid cuts the stop's edge in steps of its pitch: 1 % of the light in the middle of the PSF.
@@ -83,7 +82,7 @@ class TestLensPSFs(BaseTester):
         psi = [-15.0, 0.0, 20.0]
         disc = circular_aperture(23 * 16, 0.1 / 16, edges="area")
         thin = PSFModel(masks, lens.camera(8e-6), spectrum=GREY, fidelity=SMALL, aperture=disc).psf_bank(defocus=psi)
-        found = model(lens, masks).field_bank([(0.0, 0.0)], defocus=psi)
+        found = model(lens, masks).psf_bank(defocus=psi, field=[(0.0, 0.0)])
         for one, other in zip(found.psfs[0].detach(), thin.psfs.detach(), strict=True):
             assert float((one - other).norm() / other.norm()) < 2e-3
         self.assert_close(found.energy[0], thin.energy, rtol=2e-3, atol=0)
@@ -97,7 +96,7 @@ class TestLensPSFs(BaseTester):
             16, 0
         ).repeat_interleave(16, 1)
         thin = PSFModel(masks, lens.camera(8e-6), spectrum=GREY, fidelity=SMALL, aperture=fine).psf_bank(defocus=[5.0])
-        found = model(lens, masks, aperture=half).field_bank([(0.0, 0.0)], defocus=[5.0])
+        found = model(lens, masks, aperture=half).psf_bank(defocus=[5.0], field=[(0.0, 0.0)])
         assert float((found.psfs[0] - thin.psfs).detach().norm() / thin.psfs.detach().norm()) < 5e-3
 
     def test_feature_gaps_between_mask_pixels(self):
@@ -109,13 +108,13 @@ class TestLensPSFs(BaseTester):
         disc = circular_aperture(23 * 8, 0.1 / 8, edges="area")
         camera = lens.camera(8e-6)
         thin = PSFModel(masks, camera, gaps, spectrum=GREY, fidelity=SMALL, aperture=disc).psf_bank(defocus=[5.0])
-        found = model(lens, masks, modulator=gaps).field_bank([(0.0, 0.0)], defocus=[5.0])
+        found = model(lens, masks, modulator=gaps).psf_bank(defocus=[5.0], field=[(0.0, 0.0)])
         assert float((found.psfs[0] - thin.psfs).detach().norm() / thin.psfs.detach().norm()) < 5e-3
 
     def test_convention_a_phase_along_x_moves_the_light_to_larger_columns(self):
         lens = Lens.from_seidel(50e-3, 17.6, 0.595, 7e-3)
         ramp = torch.linspace(-1.1, 1.1, 23).expand(23, 23)[None] * 2 * math.pi * 2  # two cycles a pupil radius
-        bank = model(lens, mask_of(ramp)).field_bank([(0.0, 0.0)], defocus=[0.0])
+        bank = model(lens, mask_of(ramp)).psf_bank(defocus=[0.0], field=[(0.0, 0.0)])
         row, column = divmod(int(bank.psfs[0, 0, 0].argmax()), 21)
         step = 8e-6 * 50e-3 / 17.6 / 2 / 530e-9 / float(lens.camera(8e-6).image_distance)
         assert (row, column) == (10, 10 + round(2 / step))
@@ -125,7 +124,7 @@ class TestLensPSFs(BaseTester):
         lens = Lens.from_seidel(50e-3, 8.0, 0.595, 7e-3, coma=1.5)
         flat = PixelwiseMask(1, initial="flat")
         field = [(0.0, 0.0), (0.0, 700.0), (700.0, 0.0), (-500.0, -500.0)]
-        psfs = model(lens, flat).field_bank(field, defocus=[0.0]).psfs[:, 0, 0].detach()
+        psfs = model(lens, flat).psf_bank(defocus=[0.0], field=field).psfs[:, 0, 0].detach()
         at = torch.arange(21).double() - 10
         centroid = (
             torch.stack([(psfs * at[:, None]).sum((1, 2)), (psfs * at).sum((1, 2))], 1) / psfs.sum((1, 2))[:, None]
@@ -141,15 +140,15 @@ class TestLensPSFs(BaseTester):
         lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=6e-3)
         masks = random_mask(4)
         turned = mask_of(masks.phase.detach().rot90(1, (1, 2)))
-        one = model(lens, masks).field_bank([(-400.0, 500.0)], defocus=[3.0])
-        other = model(lens, turned).field_bank([(-500.0, -400.0)], defocus=[3.0])
+        one = model(lens, masks).psf_bank(defocus=[3.0], field=[(-400.0, 500.0)])
+        other = model(lens, turned).psf_bank(defocus=[3.0], field=[(-500.0, -400.0)])
         self.assert_close(other.psfs, one.psfs.rot90(1, (3, 4)), atol=2e-6, rtol=0)
 
     def test_feature_light_falls_as_relative_illumination_tells(self):
         lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=16e-3)
         whole = SMALL.replace(stray_light="renormalize")
         field = [(0.0, 0.0), (700.0, 0.0), (0.0, 2000.0)]
-        bank = model(lens, random_mask(5), fidelity=whole).field_bank(field, defocus=[0.0])
+        bank = model(lens, random_mask(5), fidelity=whole).psf_bank(defocus=[0.0], field=field)
         expected = lens.relative_illumination(torch.tensor([0.0, 5.6e-3, 16e-3]))
         assert float(expected[2]) < 0.85  # the rims cut the stop
         self.assert_close(bank.light[:, 0, 0], expected, atol=1e-3, rtol=0)
@@ -165,14 +164,14 @@ class TestLensPSFs(BaseTester):
         flat, pitch = PixelwiseMask(1, initial="flat"), 2e-6
         field = [(0.0, 4000.0)]
         both = PSFModel(flat, lens.camera(pitch, (0.5, math.inf)), lens=lens, spectrum=two, fidelity=SMALL)
-        psf = both.field_bank(field, defocus=[0.0]).psfs[0, 0, 0].detach()
+        psf = both.psf_bank(defocus=[0.0], field=field).psfs[0, 0, 0].detach()
         apart = [float(lens.lateral_colour(torch.tensor([8e-3]), wave)) / pitch for wave in (490e-9, 650e-9)]
         parts = []
         for wave in (490e-9, 650e-9):
             one = PSFModel(
                 flat, lens.camera(pitch, (0.5, math.inf)), lens=lens, spectrum=Spectrum.monochrome(wave), fidelity=SMALL
             )
-            parts.append(one.field_bank(field, defocus=[0.0]).psfs[0, 0, 0].detach())
+            parts.append(one.psf_bank(defocus=[0.0], field=field).psfs[0, 0, 0].detach())
         at = torch.arange(21).double() - 10
         place = lambda p: float((p * at).sum() / p.sum())  # noqa: E731
         expected = (apart[1] - apart[0]) / 2
@@ -189,11 +188,11 @@ class TestLensPSFs(BaseTester):
     def test_feature_windows_nest_and_tolerances_converge(self):
         lens, masks = Lens.named("single-50mm", 11.0, 0.595, wavelengths=(530e-9,)), random_mask(6)
         field, psi = [(500.0, 600.0)], [-20.0, 20.0]
-        exact = model(lens, masks, fidelity=SMALL.replace(window=65)).field_bank(field, defocus=psi).psfs
-        small = model(lens, masks).field_bank(field, defocus=psi).psfs
+        exact = model(lens, masks, fidelity=SMALL.replace(window=65)).psf_bank(defocus=psi, field=field).psfs
+        small = model(lens, masks).psf_bank(defocus=psi, field=field).psfs
         self.assert_close(small, exact[..., 22:43, 22:43], atol=3e-5 * float(exact.detach().max()), rtol=0)
         usual = SMALL.replace(window=65, pixel_tolerance=1e-2, double=False)
-        loose = model(lens, masks, fidelity=usual).field_bank(field, defocus=psi).psfs
+        loose = model(lens, masks, fidelity=usual).psf_bank(defocus=psi, field=field).psfs
         assert float((loose.double() - exact).detach().norm() / exact.detach().norm()) < 2e-3
 
     def test_gradcheck_to_the_masks(self):
@@ -209,7 +208,7 @@ class TestLensPSFs(BaseTester):
 
     def test_smoke_a_camera_with_the_name_of_a_lens(self):
         optics = TiDyOptics(PixelwiseMask(2), lens="single-50mm", fidelity="draft")
-        bank = optics.field_bank([(0, 0), (500, 600), (-20, 3)], defocus=[-5.0, 5.0])
+        bank = optics.psf_bank(defocus=[-5.0, 5.0], field=[(0, 0), (500, 600), (-20, 3)])
         assert isinstance(bank, FieldBank)
         assert bank.psfs.shape == (3, 2, 3, optics.window, optics.window)
         assert optics.psf_bank(defocus=[-5.0, 5.0]).psfs.shape == bank.psfs.shape[1:]
@@ -217,24 +216,14 @@ class TestLensPSFs(BaseTester):
         bank.psfs.square().sum().backward()
         assert optics.masks.phase.grad is not None
 
-    @torch.no_grad()
-    def test_feature_captures_see_the_axis_and_say_so_once(self):
-        optics = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft", sensor=None, color_space="linear")
-        image, depth = torch.rand(1, 3, 72, 80), torch.full((1, 1, 72, 80), 0.5)
-        with pytest.warns(UserWarning, match="rendered through the PSFs of the lens's axis"):
-            capture = optics(image, depth)
-        self.assert_close(optics(image, depth), capture)  # warnings are errors here
-        bank = optics.psf_bank()
-        self.assert_close(capture, render(image, optics.defocus(depth), bank, layers=optics.fidelity.layers), atol=1e-5)
-
     def test_feature_states_of_cameras_hold_the_lens(self):
         one = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft")
         other = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft")
         other.load_state_dict(one.state_dict())
         field = [(100.0, 200.0)]
         self.assert_close(
-            other.field_bank(field, defocus=[0.0]).psfs,
-            one.field_bank(field, defocus=[0.0]).psfs,
+            other.psf_bank(defocus=[0.0], field=field).psfs,
+            one.psf_bank(defocus=[0.0], field=field).psfs,
             atol=1e-6,
             rtol=0,
         )
@@ -261,12 +250,12 @@ class TestLensPSFs(BaseTester):
             (lambda lens: TiDyOptics(lens=5), TypeError, "lens must be a Lens or the name of one .*, got the number 5"),
             (lambda lens: TiDyOptics(camera=ThinLensCamera(focus_distance=torch.tensor(0.6)), lens=lens), ValueError,
              "the focus of a camera with a lens must be a number"),
-            (lambda lens: TiDyOptics().field_bank([(0, 0)]), ValueError, "field points need a camera with a lens"),
-            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).field_bank((0, 0)), ValueError,
+            (lambda lens: TiDyOptics().psf_bank(field=[(0, 0)]), ValueError, "field points need a camera with a lens"),
+            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).psf_bank(field=(0, 0)), ValueError,
              r"field must be one or more points \(y, x\) in sensor pixels, got shape \(2,\)"),
-            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).field_bank("corner"), TypeError,
+            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).psf_bank(field="corner"), TypeError,
              r"field must be points \(y, x\) in sensor pixels, got 'corner'"),
-            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).field_bank([(0, math.nan)]), ValueError,
+            (lambda lens: TiDyOptics(camera=lens.camera(8e-6), lens=lens).psf_bank(field=[(0, math.nan)]), ValueError,
              "field must be finite, got nan"),
             (lambda lens: FieldBank(torch.ones(1, 1, 1, 2, 2), torch.zeros(1), torch.zeros(1, 2), torch.ones(1, 1, 1),
                                     torch.ones(1, 1, 1)), ValueError, "psfs must have shape"),
@@ -309,7 +298,7 @@ class TestAgainstReference(BaseTester):
                 lens=lens,
                 spectrum=colours,
                 fidelity=usual,
-            ).field_bank(field, defocus=psi)
+            ).psf_bank(defocus=psi, field=field)
             for shape in (mask_of(mask), PixelwiseMask(1, initial="flat"))
         ]
         error = lambda found, expected: float((found - expected).norm() / expected.norm())  # noqa: E731

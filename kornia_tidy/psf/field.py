@@ -1,0 +1,112 @@
+r"""Where over a picture PSFs are known, and how they are found between these places.
+
+Nodes stand at the Chebyshev points of the picture's rows and columns, corners included, and PSFs between them follow a
+polynomial along either axis:
+
+.. math:: h(y, x) = \sum_{ij} \ell_i(y)\, \ell_j(x)\, h_{ij}
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from numpy.polynomial import chebyshev
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Field:
+    """Nodes over a picture, in sensor pixels.
+
+    Args:
+        size: rows and columns of the picture.
+        nodes: number of nodes along its height and along its width.
+        center: of the picture, y and x from the lens's axis.
+        origin: row and column in the picture of the first pixel of the light that is rendered: negative where a border
+            was added, and above zero in a lower strip.
+        cell: side in pixels of the cells in which PSFs are taken to first order about the middle.
+
+    Convention:
+        - The middle of the picture is at ``(size - 1) / 2``. Pixels beyond the picture, as of a border, see the PSF of
+          the nearest pixel in it.
+
+    Example:
+        >>> field = Field((101, 201), (2, 3))
+        >>> field.points
+        ((-50.0, -100.0), (-50.0, 0.0), (-50.0, 100.0), (50.0, -100.0), (50.0, 0.0), (50.0, 100.0))
+        >>> field.along(1, torch.tensor([50.0]))[0].round(decimals=3)
+        tensor([[ 0.3750,  0.7500, -0.1250]], dtype=torch.float64)
+    """
+
+    size: tuple[int, int]
+    nodes: tuple[int, int]
+    center: tuple[float, float] = (0.0, 0.0)
+    origin: tuple[int, int] = (0, 0)
+    cell: int = 64
+
+    @property
+    def points(self) -> tuple[tuple[float, float], ...]:
+        """Places of the nodes from the lens's axis, y and x, row by row."""
+        rows, columns = (
+            [self.center[axis] + x * (self.size[axis] - 1) / 2 for x in chebyshev_points(self.nodes[axis])]
+            for axis in (0, 1)
+        )
+        return tuple((y, x) for y in rows for x in columns)
+
+    def moved(self, rows: int, columns: int) -> Field:
+        """Return the field for light that begins so many rows and columns further."""
+        return replace(self, origin=(self.origin[0] + rows, self.origin[1] + columns))
+
+    def along(self, axis: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the weights of the nodes along an axis at some pixels of the picture, and their slopes for a pixel.
+
+        Args:
+            axis: 0 for rows, 1 for columns.
+            pixels: (n,) row or column in the picture.
+
+        Returns:
+            (n, nodes) each, float64; weights sum to one, slopes to zero, which they are beyond the picture.
+        """
+        half = (self.size[axis] - 1) / 2
+        places = (pixels.double() - half) / max(half, 0.5)
+        weights, slopes = lagrange(self.nodes[axis], places.clamp(-1, 1))
+        return weights, slopes / max(half, 0.5) * (places.abs() <= 1)[:, None]
+
+
+def chebyshev_points(count: int) -> list[float]:
+    """Return the extrema of a Chebyshev polynomial, from -1 to 1; the middle for a single one.
+
+    Example:
+        >>> [round(x, 3) for x in chebyshev_points(4)]
+        [-1.0, -0.5, 0.5, 1.0]
+    """
+    return [math.sin(math.pi * (2 * i - count + 1) / (2 * max(count - 1, 1))) for i in range(count)]
+
+
+def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Return values and slopes of the Lagrange polynomials of the Chebyshev points, (n, count) float64 each.
+
+    Args:
+        count: of the points.
+        places: (n,) from -1 to 1.
+
+    Example:
+        >>> values, slopes = lagrange(2, torch.tensor([0.5]))
+        >>> values.tolist(), slopes.tolist()
+        ([[0.25, 0.75]], [[-0.5, 0.5]])
+    """
+    series, derived = _series(count)
+    at = torch.from_numpy(chebyshev.chebvander(places.double().cpu().numpy(), max(count - 1, 1)))
+    return at[:, :count] @ series, at[:, : len(derived)] @ derived
+
+
+@lru_cache(maxsize=32)
+def _series(count: int) -> tuple[Tensor, Tensor]:
+    """Return the Chebyshev series of the Lagrange polynomials and of their slopes, a column for each."""
+    with torch.inference_mode(False):
+        series = np.linalg.inv(chebyshev.chebvander(chebyshev_points(count), count - 1))
+        return torch.from_numpy(series), torch.from_numpy(chebyshev.chebder(series, axis=0))

@@ -1,0 +1,121 @@
+r"""How many nodes over the field a lens needs, so that PSFs interpolated between them have a stated error.
+
+A PSF is a sum over pairs of points of the stop,
+
+.. math:: h(p) = \sum_{ab} U_a U_b^* \, e^{i (\phi_a(p) - \phi_b(p))}
+
+with the phases of the rays that join stop and pixel. Polynomials over the field that interpolate the factors of all
+pairs interpolate the PSF as well as these. So a few pairs tell, in milliseconds and for any mask, what nodes will do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature
+from kornia_tidy.optics.zernike import zernike_polynomials
+from kornia_tidy.psf.field import Field, chebyshev_points, lagrange
+from kornia_tidy.psf.lens_psfs import turned_lenses
+from kornia_tidy.runtime.default_device import on_cpu
+
+MOST_NODES = 13  # along a side
+CELLS = (128, 96, 64, 48, 32, 16)  # px along the side of a cell that sees the change of PSFs to first order
+_KNOWN = 15  # Chebyshev points along a line at which phases are computed
+_RINGS = ((0.0, 1), (0.5, 4), (0.9, 8))  # radius in the stop, and points there
+
+
+@on_cpu
+def field_nodes(
+    size: tuple[int, int],
+    center: tuple[float, float],
+    lens: Lens,
+    defocus: Sequence[float],
+    wavelength: float,
+    pixel_pitch: float,
+    reach: float,
+    tolerance: float,
+) -> Field:
+    """Return the fewest nodes over a picture, and the largest cells, with a relative error of PSFs (L2) of a tolerance.
+
+    Args:
+        size: rows and columns of the picture in pixels.
+        center: of the picture, y and x in pixels from the axis.
+        lens: in front of the sensor.
+        defocus: lowest and highest of the scene in radians at 530 nm.
+        wavelength: the shortest, in metres.
+        pixel_pitch: of the sensor in metres.
+        reach: pixels from the PSF's middle within which most of its light falls.
+        tolerance: relative error of the PSFs.
+
+    Example:
+        >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2)
+        >>> whole = field_nodes((1110, 1282), (0.0, 0.0), lens, *given)
+        >>> whole.nodes, whole.cell
+        ((7, 8), 96)
+        >>> field_nodes((64, 64), (0.0, 0.0), lens, *given).nodes
+        (1, 1)
+    """
+    found, cell = [], CELLS[0]
+    for axis in (0, 1):
+        half = (size[axis] - 1) / 2
+        errors = torch.zeros(MOST_NODES + 1, dtype=torch.float64)
+        others = (size[1 - axis] - 1) / 2
+        for beside in (-others, 0.0, others):
+            points = [(center[axis] + half * x, center[1 - axis] + beside) for x in chebyshev_points(_KNOWN)]
+            places = [point if axis == 0 else point[::-1] for point in points]
+            phases = _phases(lens, places, defocus, wavelength, pixel_pitch, reach)
+            of_nodes, bend = _errors(phases)
+            errors = torch.maximum(errors, of_nodes)
+            bent = [bend * (side / max(2 * half, 1)) ** 2 for side in CELLS]
+            cell = min(cell, next((side for side, b in zip(CELLS, bent, strict=True) if b <= tolerance), CELLS[-1]))
+        enough = (errors[1:] <= tolerance).nonzero()
+        found.append(int(enough[0]) + 1 if len(enough) else MOST_NODES)
+    return Field(size, (found[0], found[1]), center, cell=cell)
+
+
+def _errors(phases: Tensor) -> tuple[Tensor, float]:
+    """Return the error of the factors of all pairs for each number of nodes, the first entry standing for none.
+
+    And that of their first order about the middle of a cell as long as the line, were it to follow the second order.
+    """
+    fine = torch.linspace(-1, 1, 4 * _KNOWN, dtype=torch.float64)
+
+    def factors(places: Tensor) -> Tensor:
+        own = torch.tensordot(lagrange(_KNOWN, places)[0], phases, 1)  # phases are smooth: they change by little
+        return torch.polar(torch.ones_like(own), own)
+
+    exact, errors = factors(fine), [math.inf]
+    for count in range(1, MOST_NODES + 1):
+        nodes = factors(torch.tensor(chebyshev_points(count), dtype=torch.float64))
+        between = torch.tensordot(lagrange(count, fine)[0].to(nodes.dtype), nodes, 1)
+        errors.append(float((between - exact).abs().square().mean(-1).sqrt().max()))
+    second = exact.diff(n=2, dim=0) / float(fine[1] - fine[0]) ** 2  # f'' x^2 / 2, and x^4 is 1 / 5 on average
+    bend = float(second.abs().square().mean(-1).sqrt().max()) / (2 * math.sqrt(5))
+    return torch.tensor(errors, dtype=torch.float64), bend
+
+
+def _phases(
+    lens: Lens,
+    field: Sequence[tuple[float, float]],
+    defocus: Sequence[float],
+    wavelength: float,
+    pitch: float,
+    reach: float,
+) -> Tensor:
+    """Return the phase between pairs of points of the stop, of several depths and pixels, (F, pairs) radians."""
+    at = [(r * math.cos(t), r * math.sin(t)) for r, n in _RINGS for t in (2 * math.pi * i / n for i in range(n))]
+    x, y = torch.tensor(at, dtype=torch.float64).T
+    points, rows = StopQuadrature(x, x, x[None], y[None], x), []
+    first, second = torch.triu_indices(len(at), len(at), 1)
+    for turned in turned_lenses(lens, [(y * pitch, x * pitch) for y, x in field], defocus, wavelength):
+        polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, y[None], x[None])
+        phase = turned.phase((points, polynomials))[:, 0]
+        along, across = (part[0] * 2 * math.pi * pitch * reach / wavelength for part in turned.frequencies(polynomials))
+        seen = torch.cat([phase, phase + along, phase + across])  # (depths and pixels, points)
+        rows.append((seen[:, first] - seen[:, second]).flatten())
+    return torch.stack(rows)

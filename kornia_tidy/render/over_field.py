@@ -1,0 +1,242 @@
+r"""Rendering through PSFs that vary over the picture, cell by cell and without seams.
+
+The PSF of a pixel is interpolated between nodes over the field (:class:`kornia_tidy.psf.field.Field`). Within a cell it
+is taken to first order about the cell's middle:
+
+.. math:: h(y, x) = h_0 + y\, h_y + x\, h_x, \qquad \mathcal{R}(L; h) = \mathcal{R}(L; h_0) + y\,\mathcal{R}(L; h_y)
+    + x\,\mathcal{R}(L; h_x)
+
+Gather is linear in the PSFs, so that any backend renders a cell. In scatter the PSF is that of the pixel where light
+comes from, and its factors y and x stand before the sum. Occlusion divides, so the planes that it divides are blended
+and not the pictures: the PSF is that of the pixel that sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.field_bank import FieldBank
+from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.render.backends.dense_occlusion import cumulative_weight, lay_over
+from kornia_tidy.render.borders import check_border, cropped, from_spectrum, pad_border, to_spectrum
+from kornia_tidy.render.layers import assign_layers, present_layers, weight_of_layer
+from kornia_tidy.render.render_ops import Rendering, render_layers
+from kornia_tidy.render.stray_light import spread_evenly
+from kornia_tidy.runtime.mode import torch_mode
+
+
+def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> Tensor:
+    """Render a scene through PSFs that are known at the nodes of a field.
+
+    Args:
+        light: (B, C, H, W) linear light.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        bank: PSFs at the nodes of the field, in their order.
+        field: where the nodes stand, and where in the picture the light's first pixel is.
+        rendering: how.
+
+    Returns:
+        (B, C, h, w). Gradients reach light, defocus and PSFs.
+
+    Raises:
+        ValueError: if the image is too small for the border, or stray light is to be spread with occlusion.
+
+    Example:
+        >>> field, light, even = Field((8, 8), (2, 2)), torch.ones(1, 1, 8, 8), torch.ones(4, 1, 1)
+        >>> psfs = torch.tensor([0.0, 1.0, 0.0, 1.0]).view(4, 1, 1, 1, 1)  # brighter to the right
+        >>> bank = FieldBank(psfs, torch.zeros(1), torch.tensor(field.points), even, even)
+        >>> seen = render_over_field(light, torch.zeros(1, 1, 8, 8), bank, field, Rendering("gather", "reflect"))
+        >>> seen[0, 0, 3].round(decimals=2)
+        tensor([0.0000, 0.1400, 0.2900, 0.4300, 0.5700, 0.7100, 0.8600, 1.0000])
+    """
+    radius, border = bank.window // 2, rendering.border
+    check_border(border, *light.shape[-2:], bank.window)
+    plane, deep, inside, around = light, defocus, None, field
+    if border != "valid":
+        plane = pad_border(light, radius, border)
+        deep = pad_border(defocus, radius, "replicate" if border == "zero" else border)
+        around = field.moved(-radius, -radius)
+    if rendering.compositing == "occlusion":
+        if bank.veil is not None:
+            raise ValueError(
+                "stray_light 'veil' cannot be spread behind things that hide where PSFs vary over the picture: take a "
+                "fidelity with stray_light='renormalize' or 'discard', or compositing 'gather' or 'scatter'"
+            )
+        if border == "zero":
+            inside = pad_border(torch.ones_like(light[:1, :1]), radius, "zero")
+    cells = _Cells(bank, around, rendering)
+    seen = cells.scatter(plane, deep) if rendering.compositing == "scatter" else cells.see(plane, deep, inside)
+    return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
+
+
+def _veil(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> Tensor:
+    """Return the stray light, as :func:`kornia_tidy.render.stray_light.stray_light_of` has it for one PSF a layer."""
+    assert bank.veil is not None
+    taken = replace(bank, psfs=bank.veil[..., None, None], veil=None)  # PSFs of one pixel
+    whole = replace(rendering, compositing="gather", border="reflect", correlate=False)
+    if rendering.compositing == "scatter":
+        return spread_evenly(_Cells(taken, field, whole).see(light, defocus), bank.window, rendering.border)
+    spread = spread_evenly(light, bank.window, rendering.border).expand_as(light)
+    seen = _Cells(taken, field, whole).see(spread, defocus)
+    return cropped(seen, bank.window // 2 if rendering.border == "valid" else 0)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """A cell along an axis.
+
+    Args:
+        pixels: of the plane.
+        middle: of the cell in the picture, (1,).
+        offset: of the pixels from the middle.
+        mixing: (3, 2 nx) how value and slopes of a cell follow from values and slopes at the nodes along a row.
+    """
+
+    pixels: slice
+    middle: Tensor
+    offset: Tensor
+    mixing: Tensor
+
+
+class _Cells:
+    """The PSFs of cells, and what is seen through them. Planes hold the border that PSFs reach."""
+
+    def __init__(self, bank: FieldBank, field: Field, rendering: Rendering) -> None:
+        self.field, self.rendering, self.bank = field, rendering, bank
+        self.nodes, self.radius = tuple(bank.defocus.tolist()), bank.window // 2
+        self.psfs = bank.psfs.movedim(1, 0).contiguous()  # (D, F, C, P, P)
+        self.light = bank.light.movedim(1, 0)  # (D, F, C)
+
+    def _columns(self, deep: Tensor, margin: int) -> list[_Steps]:
+        """Return the cells along a row; value and slopes there follow from those at the nodes by ``mixing``."""
+        found = []
+        for across in self._steps(1, deep, margin):
+            weights, slopes = self.field.along(1, across.middle)
+            none = torch.zeros_like(weights)
+            mixing = torch.cat([torch.cat([weights, none, slopes]), torch.cat([none, weights, none])], 1)
+            found.append(replace(across, mixing=mixing.to(self.psfs)))
+        return found
+
+    def see(self, plane: Tensor, deep: Tensor, inside: Tensor | None = None) -> Tensor:
+        """Return what pixels see by gather or occlusion, (B, C, h, w)."""
+        radius, lines, columns = self.radius, [], self._columns(deep, self.radius)
+        for down, line in self._lines(deep, radius):
+            parts = []
+            for across in columns:
+                around = ..., _wider(down.pixels, radius), _wider(across.pixels, radius)
+                window, depths = plane[around], deep[around]
+                own = self._layers(cropped(depths, radius) if self.rendering.compositing == "gather" else depths)
+                if self.rendering.compositing == "gather":
+                    psfs = self._psfs(line, across, own).flatten(1, 2)
+                    seen = self._rendered(window.repeat(1, 3, 1, 1), depths, own, psfs, "valid")
+                    parts.append(_blended(seen.unflatten(1, (3, -1)), down, across))
+                else:
+                    dark = None if inside is None else inside[around]
+                    parts.append(self._occluded(window, depths, dark, own, line, down, across))
+            lines.append(torch.cat(parts, -1))
+        return torch.cat(lines, -2)
+
+    def scatter(self, plane: Tensor, deep: Tensor) -> Tensor:
+        """Return where the light of a plane goes, less the plane's rim, (B, C, h, w)."""
+        radius = self.radius
+        columns = self._columns(deep, 0)
+        total = plane.new_zeros(*plane.shape[:2], *(side + 2 * radius for side in plane.shape[-2:]))
+        for down, line in self._lines(deep, 0):
+            for across in columns:
+                window, depths = (x[..., down.pixels, across.pixels] for x in (plane, deep))
+                own = self._layers(depths)
+                psfs = self._psfs(line, across, own).flatten(1, 2)
+                parts = torch.cat([window, down.offset[:, None] * window, across.offset * window], 1)
+                parts, depths = pad(parts, (radius,) * 4), pad(depths, (radius,) * 4, mode="replicate")
+                spread = self._rendered(parts, depths, own, psfs, "zero").unflatten(1, (3, -1)).sum(1)
+                total[..., _wider(down.pixels, radius), _wider(across.pixels, radius)] += spread
+        return cropped(total, 2 * radius)
+
+    def _occluded(
+        self,
+        window: Tensor,
+        depths: Tensor,
+        inside: Tensor | None,
+        own: slice,
+        line: tuple[int, Tensor],
+        down: _Steps,
+        across: _Steps,
+    ) -> Tensor:
+        """Return what pixels of a cell see of layers that hide one another, see :func:`lay_over`."""
+        index, weight = assign_layers(depths, self.bank.defocus[own], self.rendering.layers)
+        shown = None if self.rendering.layers == "nearest" else weight.double()
+        psfs = self._psfs(line, across, own).double()  # (D, 3, C, P, P)
+        psfs = psfs.flip((-2, -1)) if self.rendering.correlate else psfs
+        lit = _blended(self._light(down, across, own)[..., None, None], down, across)  # (D, C, h, w)
+        size, side = (window.shape[-2], window.shape[-1]), psfs.shape[-1]
+
+        def blur(planes: Tensor, spectrum: Tensor) -> Tensor:
+            planes = planes if inside is None else planes * inside
+            blurred = from_spectrum(to_spectrum(planes, size)[:, None] * spectrum, size, side)
+            return _blended(blurred, down, across)
+
+        def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+            for layer in reversed(present_layers(index, shown, len(psfs))):
+                spectrum = to_spectrum(psfs[layer], size)
+                held = weight_of_layer(index, shown, layer).double()
+                behind = cumulative_weight(index, shown, layer).double()
+                yield blur(held * window, spectrum) * lit[layer], blur(held, spectrum), blur(behind, spectrum)
+
+        return lay_over(near_to_far()).to(window.dtype)
+
+    def _rendered(self, light: Tensor, depths: Tensor, own: slice, psfs: Tensor, border: str) -> Tensor:
+        given = asdict(replace(self.rendering, border=border))
+        return render_layers(light, depths, self.bank.defocus[own], psfs, None, **given)
+
+    def _lines(self, deep: Tensor, margin: int) -> Iterator[tuple[_Steps, tuple[int, Tensor]]]:
+        """Yield rows of cells with their PSFs at the nodes along the rows, values and slopes, (D, 2 nx, C P P)."""
+        for down in self._steps(0, deep, margin):
+            weights = torch.cat(self.field.along(0, down.middle)).to(self.psfs)
+            whole = self.psfs.view(len(self.psfs), self.field.nodes[0], -1)
+            own = self._layers(deep[..., _wider(down.pixels, margin), :])
+            rows = (weights @ whole[own]).view(own.stop - own.start, 2 * self.field.nodes[1], -1)
+            yield down, (own.start, rows)
+
+    def _psfs(self, line: tuple[int, Tensor], across: _Steps, own: slice) -> Tensor:
+        """Return value and slopes of the PSFs of a cell, (D, 3, C, P, P)."""
+        first, rows = line
+        part = rows[own.start - first : own.stop - first]
+        return (across.mixing @ part).unflatten(2, self.psfs.shape[2:])
+
+    def _light(self, down: _Steps, across: _Steps, own: slice) -> Tensor:
+        """Return value and slopes of the relative illumination of a cell, (D, 3, C)."""
+        weights = torch.cat(self.field.along(0, down.middle)).to(self.light)
+        rows = weights @ self.light[own].unflatten(1, self.field.nodes).flatten(2)
+        return across.mixing @ rows.unflatten(2, (self.field.nodes[1], -1)).flatten(1, 2)
+
+    def _steps(self, axis: int, deep: Tensor, margin: int) -> Iterator[_Steps]:
+        """Yield the cells along an axis. They stand at the same places of the picture whatever part of it is seen."""
+        size, side, first = self.field.size[axis], self.field.cell, 0
+        places = torch.arange(deep.shape[axis - 2] - 2 * margin) + self.field.origin[axis] + margin
+        places = places.clamp(0, size - 1).double()
+        for cell, count in zip(*torch.unique_consecutive(places // side, return_counts=True), strict=True):
+            pixels = slice(first, first := first + int(count))
+            middle = (cell * side + (cell * side + side).clamp(max=size) - 1) / 2
+            yield _Steps(pixels, middle[None], (places[pixels] - middle).to(self.psfs), middle)
+
+    def _layers(self, depths: Tensor) -> slice:
+        """Return the layers that pixels need; all where one would have to wait for their values."""
+        held = self.nodes if torch_mode() else nodes_around(self.nodes, depths)
+        first = self.nodes.index(held[0])
+        return slice(first, first + len(held))
+
+
+def _wider(pixels: slice, radius: int) -> slice:
+    return slice(pixels.start, pixels.stop + 2 * radius)
+
+
+def _blended(parts: Tensor, down: _Steps, across: _Steps) -> Tensor:
+    """Return a value with its two slopes, (N, 3, C, h, w) or (N, 3, C, 1, 1), at each pixel of a cell: (N, C, h, w)."""
+    value, along_rows, along_columns = parts.unbind(1)
+    return value + down.offset[:, None] * along_rows + across.offset * along_columns

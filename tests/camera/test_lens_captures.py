@@ -1,0 +1,195 @@
+"""Captures through a real lens: each pixel sees the PSF of its place, against PSFs computed for single pixels."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import pad
+
+from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.optics import Lens, Spectrum
+from kornia_tidy.psf import PSFBank
+from kornia_tidy.render.compositing import render
+from tests.base import BaseTester, shared
+
+CORNER = (507.0, 593.0)  # px from the axis, of a picture of 1282x1110 px
+SETTINGS = Fidelity(window=17, layer_spacing=10.0, field_tolerance=1e-2, occlusion_states="mean")
+
+
+def camera(compositing: str = "gather", border: str = "reflect", center=CORNER, **parts) -> TiDyOptics:
+    masks = PixelwiseMask(2, generator=torch.Generator().manual_seed(3))
+    parts = {"fidelity": SETTINGS, "lens": "single-50mm", "spectrum": Spectrum.monochrome(), **parts}
+    settings = {"sensor": None, "color_space": "linear", "compositing": compositing, "border": border}
+    return TiDyOptics(masks, field_center=center, **settings, **parts)
+
+
+def scene(height: int = 72, width: int = 100, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Noise of light, and steps of depth from near to far."""
+    generator = torch.Generator().manual_seed(seed)
+    steps = torch.rand(1, 1, height // 12 + 1, width // 12 + 1, generator=generator)
+    inverse = 0.2 + 3 * steps.repeat_interleave(12, 2).repeat_interleave(12, 3)[..., :height, :width]
+    return torch.rand(1, 1, height, width, generator=generator), 1 / inverse
+
+
+def place(optics: TiDyOptics, image: torch.Tensor, pixel: tuple[int, int]) -> tuple[float, float]:
+    """Where a pixel lies, from the axis."""
+    return tuple(
+        c + p - (side - 1) / 2 for c, p, side in zip(optics.field_center, pixel, image.shape[-2:], strict=True)
+    )
+
+
+PIXELS = [(0, 0), (35, 50), (63, 64), (71, 99), (20, 81)]
+
+
+class TestLensCaptures(BaseTester):
+    @pytest.mark.parametrize("border", ["reflect", "zero", "circular", "replicate", "valid"])
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
+    @torch.no_grad()
+    def test_feature_a_pixel_sees_through_the_psf_of_its_place(self, compositing, border):
+        """The whole picture is rendered through one pixel's PSFs, which must give that pixel."""
+        settings = SETTINGS if compositing == "gather" else SETTINGS.replace(field_tolerance=3e-3)  # which divides
+        optics, (image, depth) = camera(compositing, border, fidelity=settings), scene()
+        seen, margin = optics(image, depth), 8 if border == "valid" else 0
+        lost = []
+        for pixel in PIXELS:
+            sides = zip(pixel, image.shape[-2:], strict=True)
+            y, x = (min(max(p, margin), side - 1 - margin) for p, side in sides)
+            bank = optics.psf_bank(field=[place(optics, image, (y, x))])
+            axis, light = PSFBank(bank.psfs[0], bank.defocus, bank.energy[0]), bank.light[0, :, :].mean(0)
+            options = {"compositing": compositing, "border": border}
+            own = render(image, optics.defocus(depth), axis, **options)[0, :, y - margin, x - margin]
+            own = own * light if compositing == "occlusion" else own  # whose PSFs are normalised
+            lost.append((own - seen[0, :, y - margin, x - margin]).abs().max())
+        assert float(torch.stack(lost).max()) < 1e-3  # of full scale
+
+    @torch.no_grad()
+    def test_feature_light_scatters_by_the_psf_of_where_it_comes_from(self):
+        optics, (image, depth) = camera("scatter", "zero"), scene()
+        for y, x in PIXELS:
+            points = torch.zeros_like(image)
+            points[..., y, x] = 1
+            seen = pad(optics(points, depth), (8,) * 4)[..., y : y + 17, x : x + 17]
+            psfs = optics.psf_bank(field=[place(optics, image, (y, x))]).psfs[0]
+            nodes, psi = torch.tensor(optics.defocus_nodes), optics.defocus(depth)[0, 0, y, x]
+            below = int((nodes <= psi).sum().clamp(1, len(nodes) - 1)) - 1
+            share = (psi - nodes[below]) / (nodes[below + 1] - nodes[below])
+            psf = torch.lerp(psfs[below], psfs[below + 1], share)
+            rows, columns = (
+                slice(max(0, 8 - p), min(17, side - p + 8)) for p, side in zip((y, x), (72, 100), strict=True)
+            )
+            assert float((seen[0] - psf)[:, rows, columns].norm() / psf.norm()) < 0.02
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @torch.no_grad()
+    def test_feature_the_capture_of_an_independent_program(self, compositing):
+        """The corner of a single element's picture, where the PSFs of the axis are wrong by 3.5e-2 of full scale."""
+        known = np.load(shared("lenses/capture_single_f17.6.npz"))
+        lens = Lens.named("single-50mm", 17.6, 0.595, wavelengths=(530e-9,))
+        phase = torch.from_numpy(known["mask"])[None]
+        optics = TiDyOptics(
+            PixelwiseMask(1, initial=phase * 530e-9 / math.pi),
+            lens.camera(8e-6),
+            sensor=None,
+            lens=lens,
+            color_space="linear",
+            compositing=compositing,
+            border="zero",
+            spectrum=Spectrum.monochrome(),
+            field_center=CORNER,
+            fidelity=Fidelity(window=65, stray_light="discard", layer_spacing=1.0, field_tolerance=1e-3),
+        )
+        light = torch.from_numpy(known["light"])[None, None]
+        psi = torch.from_numpy(known["psi"])[torch.from_numpy(known["label"]).long()][None, None]
+        depth = 1 / (1 / optics.camera.focus_distance + psi * 530e-9 / (math.pi * optics.camera.aperture_radius**2))
+        white = optics.psf_bank(defocus=[0.0], field=[CORNER]).light[0, 0, 0]
+        wrong = (optics(light, depth.float())[0, 0] / white - torch.from_numpy(known[compositing])).abs()
+        assert float(wrong.max()) < 1e-3
+
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
+    @torch.no_grad()
+    def test_feature_white_stays_white_times_relative_illumination(self, compositing):
+        optics, (image, depth) = camera(compositing), scene()
+        seen = optics(torch.ones_like(image), depth)
+        for y, x in PIXELS:
+            light = optics.psf_bank(field=[place(optics, image, (y, x))]).light[0].mean(0)
+            assert 0.9 < float(light.min()) < 0.99  # this far off the axis
+            self.assert_close(seen[0, :, y, x], light, rtol=0, atol=1e-4)
+
+    @pytest.mark.parametrize("border", ["reflect", "valid"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @torch.no_grad()
+    def test_feature_strips_batches_copies_and_captures_before(self, compositing, border):
+        optics, (image, depth) = camera(compositing, border, center=(450.0, 520.0)), scene(136, 60)
+        whole = optics(image, depth)
+        optics(*scene(40, 40, seed=1))
+        assert torch.equal(optics(image, depth), whole)
+        assert torch.equal(copy.deepcopy(optics)(image, depth), whole)
+        other = scene(136, 60, seed=2)
+        both = optics(*(torch.cat(pair) for pair in zip((image, depth), other, strict=True)))
+        self.assert_close(both[:1], whole, rtol=0, atol=2e-6)  # layers that only the other holds round otherwise
+        optics.memory_budget = 1
+        self.assert_close(optics(image, depth), whole, rtol=0, atol=1e-5)
+
+    @torch.no_grad()
+    def test_feature_a_crop_knows_where_it_lies(self):
+        optics, (image, depth) = camera(border="valid", center=(450.0, 520.0)), scene(120, 140)
+        whole = optics(image, depth)
+        optics.field_center = (450.0 + 20, 520.0 + 30)
+        part = optics(image[..., 40:, 60:], depth[..., 40:, 60:])
+        self.assert_close(part, whole[..., 40:, 60:], rtol=0, atol=1e-3)
+
+    @torch.no_grad()
+    def test_smoke_colours_states_spectra_and_veils(self):
+        """Each is averaged or summed outside of the rendering that the others test."""
+        image, depth = scene()
+        image = image.expand(2, 3, -1, -1).contiguous()
+        shared_parts = {"spectrum": Spectrum.rgb(), "center": (300.0, 300.0)}
+        each = camera("occlusion", fidelity=SETTINGS.replace(occlusion_states="each"), **shared_parts)
+        mean = camera("occlusion", **shared_parts)
+        self.assert_close(each(image, depth), mean(image, depth), rtol=0, atol=2e-2)
+        for compositing in ("gather", "scatter"):
+            veil = camera(compositing, fidelity=SETTINGS.replace(stray_light="veil"), **shared_parts)
+            white = veil(torch.ones_like(image), torch.full_like(depth, 0.595))
+            light = veil.psf_bank(field=[place(veil, image, (30, 40))]).light[0].mean(0)
+            self.assert_close(white[0, :, 30, 40], light, rtol=0, atol=2e-2 if compositing == "scatter" else 1e-3)
+
+    def test_exception_a_veil_behind_what_hides(self):
+        optics, (image, depth) = camera("occlusion", fidelity=SETTINGS.replace(stray_light="veil")), scene(24, 24)
+        with pytest.raises(ValueError, match="stray_light 'veil' cannot be spread behind things that hide"):
+            optics(image, depth)
+
+    @torch.no_grad()
+    def test_feature_a_lens_that_does_not_matter_has_one_node(self):
+        optics = camera(center=(0.0, 0.0))
+        field = optics.psf_model.field_of((16, 16), (0.0, 0.0))
+        assert field.nodes == (1, 1)
+        image, depth = scene(24, 24)
+        axis = optics.psf_bank(field=[(0.0, 0.0)])
+        same = render(image, optics.defocus(depth), PSFBank(axis.psfs[0], axis.defocus, axis.energy[0]))
+        self.assert_close(optics(image, depth), same, rtol=0, atol=1e-3)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_gradcheck_along_a_direction(self, compositing):
+        """To masks, light and depth, against differences of captures."""
+        optics = camera(compositing, "zero", fidelity=SETTINGS.replace(double=True, window=9, layer_spacing=20.0))
+        (image, depth), generator = scene(20, 24), torch.Generator().manual_seed(5)
+        start = image.double(), depth.double(), optics.masks.phase.detach().double()
+        ways = [torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in start]
+        ways[1] *= 1e-3
+        weight = torch.rand(1, 1, 20, 24, generator=generator, dtype=torch.float64)
+
+        def capture(*given: torch.Tensor) -> torch.Tensor:
+            return (torch.func.functional_call(optics, {"masks.phase": given[2]}, given[:2]) * weight).sum()
+
+        leaves = [x.clone().requires_grad_() for x in start]
+        slopes = torch.autograd.grad(capture(*leaves), leaves)
+        for i, (slope, way) in enumerate(zip(slopes, ways, strict=True)):
+            step = 1e-5
+            ends = [capture(*(x + sign * step * way if j == i else x for j, x in enumerate(start))) for sign in (1, -1)]
+            measured = (ends[0] - ends[1]) / (2 * step)
+            assert abs(float((slope * way).sum() / measured) - 1) < 1e-3, i
