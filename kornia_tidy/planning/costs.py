@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import torch
@@ -12,8 +11,9 @@ from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.quadrature import gauss_legendre_order
+from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.energies import energy_operations
-from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import assign_layers
@@ -22,61 +22,30 @@ from kornia_tidy.render.scene import scene_of_layers
 _points = cache(gauss_legendre_order)
 
 
-@dataclass(frozen=True)
-class BankGeometry:
-    """What the cost of a PSF bank depends on, beside the fidelity.
+def bank_work(model: PSFModel, spectrum: Spectrum, states: int, fidelity: Fidelity, layers: int) -> Work:
+    r"""Return the work of an exact PSF bank.
+
+    For each layer and wavelength as many operations as :func:`~kornia_tidy.psf.energies.energy_operations` says, of its
+    two ways the one with fewer. The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and
+    as real matrices.
 
     Args:
-        states: masks shown during the exposure, K.
-        pupil: the aperture.
-        wavelengths: in metres.
-        pixel_step: a sensor pixel in the pupil, see :func:`kornia_tidy.psf.exact.exact_psf_bank`.
-    """
-
-    states: int
-    pupil: Pupil
-    wavelengths: tuple[float, ...]
-    pixel_step: float
-
-    def samples(self, fidelity: Fidelity) -> list[int]:
-        """Return the samples along a side of the field on the sensor, for each wavelength."""
-        phases = (2 * math.pi * self.pupil.extent * self.pixel_step / wavelength for wavelength in self.wavelengths)
-        return [window_side(fidelity) * _points(phase, fidelity.pixel_tolerance) for phase in phases]
-
-
-def bank_operations(geometry: BankGeometry, fidelity: Fidelity, layers: int) -> float:
-    r"""Return the operations of an exact PSF bank.
-
-    For each layer and wavelength as many as :func:`~kornia_tidy.psf.energies.energy_operations` says, of its two
-    ways the one with fewer.
+        model: whose aperture and pixels count.
+        spectrum: whose wavelengths count.
+        states: masks shown during the exposure.
+        fidelity: its window, points and precision count.
+        layers: how many.
 
     Example:
-        >>> geometry = BankGeometry(5, Pupil(torch.ones(23, 23), 0.1), (530e-9,), 2e-7)
-        >>> f"{bank_operations(geometry, Fidelity(window=65), 21):.1e}"
-        '3.9e+08'
+        >>> print(bank_work(PSFModel(), Spectrum.rgb(), 5, Fidelity(window=65), 21))
+        1.2e+09 operations, 11 MiB
     """
-    cells, window = geometry.pupil.amplitude.shape[-1], window_side(fidelity)
-    orders = [side // window for side in geometry.samples(fidelity)]
-    ways = [energy_operations(geometry.states, window, order, cells) for order in orders]
-    return (2 if fidelity.double else 1) * layers * sum(min(each) for each in ways)
-
-
-def memory_bytes(geometry: BankGeometry, channels: int, fidelity: Fidelity, layers: int, rendering: int) -> int:
-    """Return the peak memory of a capture without gradients beyond the image: of the bank or the renderer, whichever.
-
-    The bank holds its PSFs, and its kernels four times: as remembered, in one piece, and as real matrices.
-
-    Args:
-        geometry: of the bank.
-        channels: of the image.
-        fidelity: its window, points and precision count.
-        layers: PSFs held.
-        rendering: what the renderer takes, see :func:`rendering_work`.
-    """
-    real = 8 if fidelity.double else 4
-    psfs = real * layers * channels * window_side(fidelity) ** 2
-    kernels = 2 * real * layers * max(geometry.samples(fidelity)) * geometry.pupil.amplitude.shape[-1]
-    return psfs + max(4 * kernels, rendering)
+    pupil, window, real = model.pupil, window_side(fidelity), 8 if fidelity.double else 4
+    cells, phase = pupil.amplitude.shape[-1], 2 * math.pi * pupil.extent * float(model.pixel_step)
+    orders = [_points(phase / wavelength, fidelity.pixel_tolerance) for wavelength in spectrum.wavelengths]
+    ways = [energy_operations(states, window, order, cells) for order in orders]
+    psfs, kernels = len(spectrum.plane_weights) * window**2, 2 * window * max(orders) * cells
+    return Work(real / 4 * layers * sum(min(each) for each in ways), real * layers * (psfs + 4 * kernels))
 
 
 def window_side(fidelity: Fidelity) -> int:

@@ -20,9 +20,6 @@ with the products :math:`C_{jbb'}` of the light at b and at b'.
 The sums over f are computed at some depths of the scene, and the power between them is interpolated. Where bins add up
 in amplitude, differences at two depths are assumed equal or independent, whichever gives the larger error.
 
-PSFs are band-limited in :math:`\psi`, so those at some sixty Chebyshev nodes give all others by interpolation, and the
-kind and spacing of the layers only change the coefficients.
-
 This is an estimate, which assumes that the light of an octave has random phases. The safety factors of
 :mod:`kornia_tidy.planning.planner` cover the deviation of real scenes.
 """
@@ -38,62 +35,6 @@ from torch import Tensor
 from kornia_tidy.planning.scene_light import SceneLight, interpolation
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
 from kornia_tidy.render.layers import assign_layers
-
-
-def chebyshev_nodes(lo: float, hi: float, count: int) -> Tensor:
-    """Return the Chebyshev points of the first kind on [lo, hi], ascending, (count,) float64.
-
-    Example:
-        >>> chebyshev_nodes(0, 2, 3).round(decimals=3).tolist()
-        [0.134, 1.0, 1.866]
-    """
-    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (math.pi / count)
-    return (lo + hi) / 2 - (hi - lo) / 2 * angle.cos()
-
-
-def chebyshev_weights(at: Tensor, nodes: Tensor) -> Tensor:
-    r"""Return the weights of polynomial interpolation from Chebyshev nodes to other positions.
-
-    Args:
-        at: (A,) positions within the nodes' range, float64.
-        nodes: (n,) from :func:`chebyshev_nodes`.
-
-    Returns:
-        (A, n); rows add up to one.
-
-    Source: Berrut and Trefethen, Barycentric Lagrange interpolation, SIAM Review 46(3), 501 (2004), equation 5.1.
-
-    Example:
-        >>> nodes = chebyshev_nodes(0, 4, 3)
-        >>> weights = chebyshev_weights(torch.tensor([1.0, 3.5], dtype=torch.float64), nodes)
-        >>> (weights @ nodes**2).round(decimals=6).tolist()
-        [1.0, 12.25]
-    """
-    count = len(nodes)
-    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (math.pi / count)
-    barycentric = angle.sin() * (1 - 2 * (torch.arange(count) % 2))
-    distance = at[:, None] - nodes
-    on_node = distance == 0
-    terms = torch.where(on_node.any(1, keepdim=True), on_node, barycentric / torch.where(on_node, 1, distance))
-    return terms / terms.sum(1, keepdim=True)
-
-
-def nodes_needed(half_range: float, bandwidth: float) -> int:
-    r"""Return the number of Chebyshev nodes that interpolate a band-limited function of defocus to about 1e-6.
-
-    The Chebyshev coefficients of :math:`e^{i b L t}` are Bessel functions :math:`J_n(b L)`, which vanish beyond
-    :math:`n = b L` faster than any exponential.
-
-    Args:
-        half_range: L in radians of defocus.
-        bandwidth: b, the largest squared radius of the pupil times 530 nm over the shortest wavelength.
-
-    Example:
-        >>> nodes_needed(20.0, 1.25)
-        43
-    """
-    order = half_range * bandwidth
-    return math.ceil(order + 4 * order ** (1 / 3) + 6)
 
 
 def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:
@@ -147,6 +88,5 @@ def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight, *, 
 
 def _power_in_octaves(change: Tensor, shapes: Tensor) -> Tensor:
     """Return the mean square of light of power one in each octave, (C, octaves), behind a change of PSFs (C, P, P)."""
-    spectrum = torch.fft.rfft2(change, s=(shapes.shape[-2],) * 2)
-    power = (spectrum.real.square() + spectrum.imag.square()).double()
+    power = torch.fft.rfft2(change, s=(shapes.shape[-2],) * 2).abs().square().double()
     return torch.einsum("cuv,cjuv->cj", power, shapes)

@@ -20,8 +20,8 @@ its window, and the darkening of pixels that are reached by a small part of a PS
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from bisect import bisect_left
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
@@ -34,13 +34,14 @@ from torch.nn.functional import max_pool2d
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.planning.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_steps
-from kornia_tidy.planning.costs import bank_operations, memory_bytes, rendering_work, window_side
+from kornia_tidy.planning.costs import bank_work, rendering_work, window_side
 from kornia_tidy.planning.depth_energy import Depths
 from kornia_tidy.planning.error_model import change_error, layer_coefficients
-from kornia_tidy.planning.psf_samples import PSFSamples
+from kornia_tidy.planning.psf_samples import PSFSamples, remembered
 from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes
+from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
 from kornia_tidy.render.stray_light import share_in_frame, share_within
@@ -59,7 +60,7 @@ _DEPTHS = 16  # of the scene at which PSFs are compared
 _WINDOW = 65  # px, to compare all but windows: a fifth of the light lies outside, but a few per cent of its square
 
 
-class Planner:
+class Planner(PSFSamples):
     """Planner of scenes for one camera; PSF samples of the masks are computed once and shared by all scenes.
 
     The samples belong to the masks at the time of construction. ``optics.plan`` plans one scene for one tolerance.
@@ -76,9 +77,6 @@ class Planner:
         [True, True]
     """
 
-    def __init__(self, optics: Any, channels: int) -> None:
-        self.samples = PSFSamples(optics, channels)
-
     def scene(self, defocus: Tensor, light: Tensor | None = None) -> PlannedScene:
         """Return a scene to ask for errors and plans.
 
@@ -86,14 +84,14 @@ class Planner:
             defocus: (B, 1, H, W) or (1, 1, H, W) radians.
             light: (B, C, H, W) linear light. Default: a typical photograph.
         """
-        return PlannedScene(self.samples, defocus, light)
+        return PlannedScene(self, defocus, light)
 
 
 class PlannedScene:
     """Error prediction and plans for one scene, made by :meth:`Planner.scene`.
 
     Attributes:
-        samples: PSFs of the camera's masks.
+        planner: of the camera.
         images: number of images.
         reference: fidelity that errors refer to.
         light: power of the light by channel, octave and depth.
@@ -101,23 +99,23 @@ class PlannedScene:
     """
 
     @torch.no_grad()
-    def __init__(self, samples: PSFSamples, defocus: Tensor, light: Tensor | None) -> None:
+    def __init__(self, planner: Planner, defocus: Tensor, light: Tensor | None) -> None:
         height, width = defocus.shape[-2:]
         self.images = len(defocus if light is None else light)
-        self.samples, self._defocus = samples, defocus.detach()
+        self.planner, self._defocus = planner, defocus.detach()
         self._known: dict[Any, Any] = {}
-        self.reference = samples.reference(height, width)
+        self.reference = planner.reference(height, width)
         self._full = window_side(self.reference)
-        self._narrow = self._full if samples.wide_blur else min(_WINDOW, self._full)
+        self._narrow = self._full if planner.wide_blur else min(_WINDOW, self._full)
         size = spectrum_size(self._full)
-        colours = range(1, len(samples.spectrum.basis or (1,)))
-        margin = self._full // 2 if samples.border == "valid" else 0
-        bins = 256 if samples.compositing == "gather" else 128
-        self._depths = Depths(defocus, *samples.defocus_range, samples.border, margin, bins)
+        colours = range(1, len(planner.spectrum.basis or (1,)))
+        margin = self._full // 2 if planner.border == "valid" else 0
+        bins = 256 if planner.compositing == "gather" else 128
+        self._depths = Depths(defocus, *planner.model.camera.defocus_range, planner.border, margin, bins)
         if light is None:  # differences between channels are assumed as large as between pixels
-            self.light, self.level = SceneLight.unseen(self._depths, samples.channels, size), 0.5
+            self.light, self.level = SceneLight.unseen(self._depths, planner.channels, size), 0.5
             self._contrast = CONTRAST
-            self._apart = torch.full((samples.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
+            self._apart = torch.full((planner.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
             self._colours = [self.light for _ in colours]
         else:
             self.light, self.level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
@@ -129,32 +127,16 @@ class PlannedScene:
         self._outlines = self._at_outlines(light) if self._occlusion else 0.0
 
     def _seen_light(self, light: Tensor, size: int) -> SceneLight:
-        return SceneLight.seen(light, self._depths, self.samples.border, size, self.samples.compositing)
+        return SceneLight.seen(light, self._depths, self.planner.border, size, self.planner.compositing)
 
     def error(self, fidelity: Fidelity) -> float:
-        """Return the predicted error of a fidelity, full scale 1; its window is at most that of the reference.
-
-        Raises:
-            ValueError: if the fidelity is not one whose error is known.
-        """
-        if fidelity.propagation != "exact" or fidelity.stray_light == "discard":
-            raise ValueError(
-                f"errors are predicted for propagation 'exact' and stray_light 'veil' or 'renormalize', got "
-                f"{fidelity.propagation!r} and {fidelity.stray_light!r}"
-            )
-        if fidelity.window is None or fidelity.window > self._full:
-            raise ValueError(
-                f"errors are predicted for a fixed window up to the reference's {self._full}, got {fidelity.window}"
-            )
-        if self.samples.captures > 1 and fidelity.occlusion_states != "each":
-            raise ValueError(f"errors are predicted for occlusion_states 'each', got {fidelity.occlusion_states!r}")
+        """Return the predicted error, full scale 1, of an exact fidelity with a window up to the reference's."""
         return sum(error for _, error in self._parts(fidelity))
 
     def operations(self, fidelity: Fidelity) -> float:
         """Return the operations of a capture with its PSFs, those of float64 counted twice."""
-        samples = self.samples
-        bank = bank_operations(samples.geometry(fidelity), fidelity, self._computed(fidelity))
-        return (samples.captures if self._occlusion else 1) * (bank + self._work(fidelity).operations)
+        bank = self._bank_work(fidelity, self._computed(fidelity.layers, fidelity.layer_spacing))
+        return self.planner.captures * (bank.operations + self._work(fidelity).operations)
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -181,7 +163,7 @@ class PlannedScene:
 
     def _wavelength_counts(self, tolerance: float) -> Iterator[int | None]:
         """Yield candidate numbers of wavelengths, up to the first with an error small against the tolerance."""
-        for count in self.samples.wavelength_counts():
+        for count in self.planner.wavelength_counts():
             error = SAFETY * self._wavelength_error(count)
             if error <= tolerance:
                 yield count
@@ -190,9 +172,9 @@ class PlannedScene:
         yield None
 
     def _described(self, fidelity: Fidelity, tolerance: float) -> RenderPlan:
-        samples = self.samples
-        held = self._held(window_side(fidelity))
-        exact = samples.psfs(self._at, self._narrow) - samples.layered(self.reference, self._at, self._narrow)
+        planner, kind = self.planner, (fidelity.layers, fidelity.layer_spacing)
+        computed = self._computed(*kind)
+        held = planner.captures * max(computed, len(nodes_around(self._rendered(fidelity), self._defocus)))
         return RenderPlan(
             fidelity=fidelity,
             reference=self.reference,
@@ -201,14 +183,11 @@ class PlannedScene:
             error_parts=tuple(self._parts(fidelity)),
             operations=self.operations(fidelity),
             reference_operations=self.operations(self.reference),
-            memory_bytes=self._memory(fidelity),
-            layers_present=self._computed(fidelity),
-            layers_total=len(samples.sampled(fidelity)),
-            states=samples.captures,
-            wavelengths=len(samples.geometry(fidelity).wavelengths),
-            wavelengths_total=len(samples.spectrum.wavelengths),
-            light_held=(float(held.min()), float(held.max())),
-            reference_error=change_error(self._at, exact, self.light, alternate=True),
+            memory_bytes=max(self._bank_work(fidelity, held).memory, self._work(fidelity).memory),
+            layers=(computed, len(planner.sampled(*kind))),
+            window=window_side(fidelity),
+            wavelengths=(len(planner.spectrum_of(fidelity).wavelengths), len(planner.spectrum.wavelengths)),
+            states=planner.captures,
         )
 
     def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
@@ -217,7 +196,7 @@ class PlannedScene:
         narrower = window_side(fidelity) < self._full
         ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
         window_error = of_window * max(self._window_error(window_side(fidelity), way) for way in ways)
-        layer_error = SAFETY * share * self._layer_error(fidelity)
+        layer_error = SAFETY * share * self._layer_error(fidelity.layers, fidelity.layer_spacing)
         return [
             ("layers", layer_error + self._order_error(fidelity) + self._dark_error(fidelity)),
             ("window", WINDOW_SAFETY * window_error + self._spread_error(fidelity)),
@@ -226,82 +205,77 @@ class PlannedScene:
             ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self.level),
         ]
 
-    def _remembered(self, key: Any, found: Callable[[], Any]) -> Any:
-        if key not in self._known:
-            self._known[key] = found()
-        return self._known[key]
-
     # ---------------------------------------------------------------------- errors of single changes
 
     @cached_property
     def _psfs(self) -> Tensor:
         """PSFs at some depths of the scene, in the window of the reference."""
-        return self.samples.psfs(self._at, self._full, dtype=torch.float32)
+        return self.planner.psfs(self._at, self._full, dtype=torch.float32)
 
+    @remembered
     def _held(self, window: int) -> Tensor:
         """Return the share of the light in a window, at some depths of the scene, (D, C)."""
-        return self._remembered(("held", window), lambda: _cropped(self._psfs, window).sum((-2, -1)).double())
+        return _cropped(self._psfs, window).sum((-2, -1)).double()
 
-    def _layer_error(self, fidelity: Fidelity) -> float:
-        def found() -> float:
-            own, theirs = (self.samples.layered(each, self._at, self._narrow) for each in (fidelity, self.reference))
-            return change_error(self._at, own - theirs, self.light, alternate=True)
+    @remembered
+    def _layer_error(self, layers: str, spacing: float) -> float:
+        kinds = (layers, spacing), (REFERENCE.layers, REFERENCE.layer_spacing)
+        if kinds[0] == kinds[1]:
+            return 0.0
+        own, theirs = (self._layered(*kind) for kind in kinds)
+        return change_error(self._at, own - theirs, self.light, alternate=True)
 
-        key = fidelity.layers, fidelity.layer_spacing
-        return 0.0 if key == (REFERENCE.layers, REFERENCE.layer_spacing) else self._remembered(key, found)
-
+    @remembered
     def _window_error(self, window: int, stray_light: str) -> float:
-        def found() -> float:
-            psfs = self._psfs
-            if stray_light == "outlines":  # PSFs are normalised in both windows, with and without stray light
-                psfs = psfs / psfs.sum((-2, -1), keepdim=True)
-            kept = _cropped(psfs, window)
-            if stray_light != "veil":
-                kept = kept / kept.sum((-2, -1), keepdim=True)
-            changes = -psfs
-            _cropped(changes, window).add_(kept)
-            return change_error(self._at, changes, self.light)
+        psfs = self._psfs
+        if stray_light == "outlines":  # PSFs are normalised in both windows, with and without stray light
+            psfs = psfs / psfs.sum((-2, -1), keepdim=True)
+        kept = _cropped(psfs, window)
+        if stray_light != "veil":
+            kept = kept / kept.sum((-2, -1), keepdim=True)
+        changes = -psfs
+        _cropped(changes, window).add_(kept)
+        return change_error(self._at, changes, self.light)
 
-        return self._remembered((window, stray_light), found)
-
+    @remembered
     def _point_error(self, tolerance: float) -> float:
-        def psfs(tolerance: float) -> Tensor:
-            # At all wavelengths: that of the shortest changes most.
-            return self._remembered(
-                ("points", tolerance), lambda: self.samples.psfs(self._at, self._narrow, tolerance, wavelengths=None)
-            )
+        if tolerance <= REFERENCE.pixel_tolerance:
+            return 0.0
+        return change_error(self._at, self._sampled(tolerance) - self._sampled(REFERENCE.pixel_tolerance), self.light)
 
-        def found() -> float:
-            return change_error(self._at, psfs(tolerance) - psfs(REFERENCE.pixel_tolerance), self.light)
+    @remembered
+    def _sampled(self, tolerance: float) -> Tensor:
+        """Return PSFs at all wavelengths: that of the shortest changes most."""
+        return self.planner.psfs(self._at, self._narrow, tolerance, None)
 
-        return 0.0 if tolerance <= REFERENCE.pixel_tolerance else self._remembered(tolerance, found)
-
+    @remembered
     def _wavelength_error(self, count: int | None) -> float:
         r"""Return the error from binned wavelengths.
 
         With a reflectance basis, channel c captures :math:`h_c * L_c + \sum_b h_{cb} * (L_b - L_c)` with the PSF
         :math:`h_c = \sum_b h_{cb}` of white.
         """
-
-        def planes(count: int | None) -> Tensor:
-            return self._remembered(("planes", count), lambda: self.samples.binned(count, self._at, self._narrow))
-
-        def found() -> float:
-            changes = planes(count) - planes(None)
-            own = torch.arange(len(changes[0]))
-            colours = [changes[:, own, (own + k) % len(own)] for k in range(1, changes.shape[2])]
-            changed = zip((changes.sum(2), *colours), (self.light, *self._colours), strict=True)
-            return sum(change_error(self._at, change, light) for change, light in changed)
-
-        if count is None or count >= len(self.samples.spectrum.wavelengths):
+        if count is None or count >= len(self.planner.spectrum.wavelengths):
             return 0.0
-        return self._remembered(("wavelengths", count), found)
+        changes = self._binned(count) - self._binned(None)
+        own = torch.arange(len(changes[0]))
+        colours = [changes[:, own, (own + k) % len(own)] for k in range(1, changes.shape[2])]
+        changed = zip((changes.sum(2), *colours), (self.light, *self._colours), strict=True)
+        return sum(change_error(self._at, change, light) for change, light in changed)
+
+    @remembered
+    def _binned(self, count: int | None) -> Tensor:
+        return self.planner.binned(count, self._at, self._narrow)
+
+    @remembered
+    def _layered(self, layers: str, spacing: float) -> Tensor:
+        return self.planner.layered(layers, spacing, self._at, self._narrow)
 
     # ---------------------------------------------------------------------- what occlusion adds
 
     @property
     def _occlusion(self) -> bool:
-        return self.samples.compositing == "occlusion"
+        return self.planner.compositing == "occlusion"
 
     def _at_outlines(self, light: Tensor | None) -> float:
         """Return the root mean square, over all pixels, of the contrast of those with a neighbour at another depth."""
@@ -320,7 +294,7 @@ class PlannedScene:
         Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers the image alone: in a tiny image
         PSFs are renormalised by the small share inside it, and their errors grow likewise.
         """
-        if not self._occlusion or self.samples.border != "zero":
+        if not self._occlusion or self.planner.border != "zero":
             return 1.0
         shares = share_in_frame(self._psfs, self._defocus.shape[-2:]) / self._held(self._full)
         return min(1.0, float(shares.amin()))
@@ -352,7 +326,7 @@ class PlannedScene:
         Occlusion normalises each layer by its alpha, so the layer's stray light should have the mean of the layer. In
         the others more stray light stays within a border ``"zero"`` where the window is narrower.
         """
-        if fidelity.stray_light != "veil" or not (self._occlusion or self.samples.border == "zero"):
+        if fidelity.stray_light != "veil" or not (self._occlusion or self.planner.border == "zero"):
             return 0.0
         if not self._occlusion:
             height, width = self._defocus.shape[-2:]
@@ -365,38 +339,33 @@ class PlannedScene:
 
     # ---------------------------------------------------------------------- costs
 
-    def _computed(self, fidelity: Fidelity) -> int:
+    @remembered
+    def _computed(self, layers: str, spacing: float) -> int:
         """Return the number of PSFs computed for the scene: all layers from its farthest to its nearest."""
+        nodes = self.planner.nodes(layers, spacing)
+        weights, _ = layer_coefficients(self._depths.psi[[0, -1]], nodes, layers, self.planner.band)
+        used = torch.nonzero((weights != 0).any(0)).flatten()
+        return int(used[-1] - used[0] + 1)
 
-        def found() -> int:
-            nodes = self.samples.nodes(fidelity)
-            weights, _ = layer_coefficients(self._depths.psi[[0, -1]], nodes, fidelity.layers, self.samples.band)
-            used = torch.nonzero((weights != 0).any(0)).flatten()
-            return int(used[-1] - used[0] + 1)
-
-        return self._remembered(("computed", fidelity.layers, fidelity.layer_spacing), found)
-
-    def _memory(self, fidelity: Fidelity) -> int:
-        samples, nodes = self.samples, self._rendered(fidelity)
-        farthest, nearest = float(self._depths.psi[0]), float(self._depths.psi[-1])
-        first, last = max(0, bisect_right(nodes, farthest) - 1), min(len(nodes) - 1, bisect_left(nodes, nearest))
-        held = samples.captures * max(self._computed(fidelity), last - first + 1)
-        rendering = self._work(fidelity).memory
-        return memory_bytes(samples.geometry(fidelity), samples.planes, fidelity, held, rendering)
+    def _bank_work(self, fidelity: Fidelity, layers: int) -> Work:
+        planner = self.planner
+        return bank_work(planner.model, planner.spectrum_of(fidelity), planner.together, fidelity, layers)
 
     def _rendered(self, fidelity: Fidelity) -> tuple[float, ...]:
         """Return the defocus of the rendered layers."""
-        nodes = self.samples.nodes(fidelity)
+        nodes = self.planner.nodes(fidelity.layers, fidelity.layer_spacing)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
     def _work(self, fidelity: Fidelity) -> Work:
         """Return the work of the renderer for the scene."""
-        samples, nodes = self.samples, self._rendered(fidelity)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        given = self._defocus, self.images, samples.planes, nodes, window_side(fidelity)
-        options = {"layers": layers, "compositing": samples.compositing, "border": samples.border}
-        key = layers, nodes, window_side(fidelity), fidelity.double
-        return self._remembered(key, lambda: rendering_work(*given, **options, double=fidelity.double))
+        return self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
+
+    @remembered
+    def _rendering(self, layers: str, nodes: tuple[float, ...], window: int, double: bool) -> Work:
+        planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
+        how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
+        return rendering_work(*given, **how)
 
 
 def _cropped(psfs: Tensor, window: int) -> Tensor:

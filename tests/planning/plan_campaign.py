@@ -43,7 +43,6 @@ from kornia_tidy.planning import psf_samples
 from kornia_tidy.planning.candidates import REFERENCE
 from kornia_tidy.planning.plan import plan_scene
 from kornia_tidy.planning.render_plan import RenderPlan
-from kornia_tidy.planning.wide_plan import WidePlan
 from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
@@ -131,7 +130,7 @@ def trial(seed: int) -> Trial:
     with warnings.catch_warnings(), patch.object(psf_samples, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
         warnings.simplefilter("ignore")  # that windows this narrow do not hold the light they should
         plan = plan_scene(optics, defocus, light, light.shape[:2], tolerance)
-        measured = (_ray_error if isinstance(plan, WidePlan) else _error)(optics, light, defocus, plan)
+        measured = (_ray_error if plan.fidelity.window is None else _error)(optics, light, defocus, plan)
     return Trial(seed, wide, drawn, tolerance, plan.predicted_error, measured, plan.fidelity.name)
 
 
@@ -142,7 +141,7 @@ def _error(optics: TiDyOptics, light: Tensor, defocus: Tensor, plan: RenderPlan)
 
 
 @torch.no_grad()
-def _ray_error(optics: TiDyOptics, light: Tensor, defocus: Tensor, plan: WidePlan) -> float:
+def _ray_error(optics: TiDyOptics, light: Tensor, defocus: Tensor, plan: RenderPlan) -> float:
     """The error against the reference's PSFs at each depth of the scene."""
     window = plan.window
     exact = optics.with_fidelity(REFERENCE.replace(window=window))

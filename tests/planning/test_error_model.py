@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import pytest
 import scipy.ndimage
-import scipy.special
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,13 +9,7 @@ from hypothesis import strategies as st
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.planning.depth_energy import Depths, octave_filters
-from kornia_tidy.planning.error_model import (
-    change_error,
-    chebyshev_nodes,
-    chebyshev_weights,
-    layer_coefficients,
-    nodes_needed,
-)
+from kornia_tidy.planning.error_model import change_error, layer_coefficients
 from kornia_tidy.planning.psf_samples import PSFSamples
 from kornia_tidy.planning.scene_light import CONTRAST, SceneLight, coarser, natural_power, power_spectrum
 from kornia_tidy.render.compositing import render
@@ -29,37 +22,6 @@ def one_depth(power: torch.Tensor) -> SceneLight:
     """Light of a power spectrum, all at one depth."""
     octaves = (power[:, None] * octave_filters(power.shape[-2])).sum((-2, -1))
     return SceneLight(power, FLAT.psi, octaves[..., None])
-
-
-class TestInterpolation(BaseTester):
-    @settings(max_examples=20)
-    @given(st.floats(-30, 0), st.floats(1, 40), st.integers(2, 12))
-    def test_property_polynomials_are_exact(self, lo, length, count):
-        nodes = chebyshev_nodes(lo, lo + length, count)
-        at = torch.cat([torch.linspace(lo, lo + length, 7, dtype=torch.float64), nodes])
-        polynomial = torch.special.chebyshev_polynomial_t(2 * (at - lo) / length - 1, count - 1)
-        known = torch.special.chebyshev_polynomial_t(2 * (nodes - lo) / length - 1, count - 1)
-        self.assert_close(chebyshev_weights(at, nodes) @ known, polynomial, atol=1e-9, rtol=0)
-
-    @pytest.mark.parametrize(("half_range", "bandwidth"), [(20.0, 1.3), (8.0, 1.1), (1.0, 2.2), (100.0, 1.5)])
-    def test_feature_enough_nodes_for_the_bandwidth(self, half_range, bandwidth):
-        """The terms left out of exp(i b L t) in Chebyshev polynomials are 2 J_n(bL)."""
-        left_out = scipy.special.jv(range(nodes_needed(half_range, bandwidth), 1000), half_range * bandwidth)
-        assert 2 * abs(left_out).sum() < 1e-5
-
-    def test_feature_sampled_psfs_carry_those_of_every_defocus(self):
-        optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=Fidelity(window=31, stray_light="discard"))
-        nodes = chebyshev_nodes(-20, 20, nodes_needed(20, PSFSamples(optics, 3).band))
-        psi = (-19.97, -3.3, 0.01, 7.7, 19.0)
-        with torch.no_grad():
-            direct, known = (optics.psf_bank(3, None, at).psfs for at in (psi, tuple(nodes.tolist())))
-        sampled = torch.einsum("an,ncpq->acpq", chebyshev_weights(torch.tensor(psi).double(), nodes), known.double())
-        assert float((sampled - direct).abs().sum((-2, -1)).max()) < 1e-4
-
-    def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
-        """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
-        optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
-        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).band <= 1.2 * 530 / 470
 
 
 class TestPower(BaseTester):
@@ -126,6 +88,11 @@ class TestPower(BaseTester):
 
 
 class TestLayers(BaseTester):
+    def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
+        """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
+        optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
+        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).band <= 1.2 * 530 / 470
+
     @pytest.mark.parametrize("layers", ["nearest", "linear", "cubic", "bandlimited"])
     def test_feature_a_pixel_takes_what_the_camera_gives_it(self, layers):
         """Against the capture of a point, which is the layered PSF of the camera."""
@@ -141,14 +108,6 @@ class TestLayers(BaseTester):
             mode = "nearest" if layers == "nearest" else "linear"
             coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
         self.assert_close(coded, psf, atol=1e-12, rtol=0)
-
-    def test_feature_wide_ranges_take_psfs_of_their_own_for_each_depth(self, monkeypatch):
-        """And narrow ones interpolate them: the same to a millionth."""
-        optics, depths = TiDyOptics(PixelwiseMask(1), sensor=None), (-7.3, 0.2, 11.0)
-        fidelity = Fidelity(layers="linear", layer_spacing=1.0)
-        interpolated = PSFSamples(optics, 3).layered(fidelity, depths, 15)
-        monkeypatch.setattr("kornia_tidy.planning.psf_samples._MOST_NODES", 1)
-        self.assert_close(PSFSamples(optics, 3).layered(fidelity, depths, 15), interpolated, rtol=0, atol=1e-6)
 
     def test_feature_differences_are_those_of_convolved_images(self):
         generator = torch.Generator().manual_seed(0)

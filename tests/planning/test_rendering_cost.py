@@ -14,7 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.overlap_ops import SOURCE
-from kornia_tidy.planning.costs import bank_operations, rendering_work, window_side
+from kornia_tidy.planning.costs import bank_work, rendering_work, window_side
 from kornia_tidy.planning.planner import Planner
 from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.dispatch import choose
@@ -40,7 +40,7 @@ class TestBank(BaseTester):
         with FlopCounterMode(display=False) as counter, forward_ad.dual_level():
             optics.psf_bank(3, None, (-5.0, 0.0, 5.0))
         counted = counter.get_total_flops()
-        expected = bank_operations(Planner(optics, 3).samples.geometry(fidelity), fidelity, 3) / (
+        expected = bank_work(optics.psf_model, optics.spectrum, 2, fidelity, 3).operations / (
             2 if fidelity.double else 1
         )
         assert expected == pytest.approx(counted, rel=0.05)

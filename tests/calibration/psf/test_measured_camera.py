@@ -88,7 +88,7 @@ class TestMeasuredCamera(BaseTester):
         optics = measured_camera(psfs, sensor=None, compositing=compositing, border=border)
         plan = optics.plan(scene[1], tolerance=1e-6)
         assert (plan.predicted_error, plan.fidelity.window) == (0.0, psfs.bank.window)
-        assert plan.layers_present <= plan.layers_total == len(DISTANCES)
+        assert plan.layers[0] <= plan.layers[1] == len(DISTANCES)
         assert plan.operations > 0
         assert "measured PSFs" in str(plan)
         assert torch.equal(optics(*scene), optics.with_fidelity(plan.fidelity)(*scene))
