@@ -38,7 +38,7 @@ def bank_work(model: PSFModel, spectrum: Spectrum, states: int, fidelity: Fideli
 
     Example:
         >>> print(bank_work(PSFModel(), Spectrum.rgb(), 5, Fidelity(window=65), 21))
-        1.2e+09 operations, 11 MiB
+        1e+09 operations, 5 MiB
     """
     pupil, window, real = model.pupil, window_side(fidelity), 8 if fidelity.double else 4
     cells, phase = pupil.amplitude.shape[-1], 2 * math.pi * pupil.extent * float(model.pixel_step)
