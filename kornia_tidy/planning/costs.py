@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import torch
@@ -95,4 +96,6 @@ def rendering_work(
     image = torch.zeros((), dtype=dtype, device=defocus.device).expand(batch, channels, *defocus.shape[-2:])
     psfs = image.new_zeros(()).expand(len(nodes), channels, window, window)
     scene = scene_of_layers(image, index, weight, psfs, None, border, compositing, dtype)
-    return choose(scene).work(scene)
+    # A processor's choice looks at the PSFs' values: of one layer, as all of a wide range would take gigabytes.
+    one = replace(scene, psfs=psfs[:1]) if psfs.device.type == "cpu" else scene
+    return choose(one).work(scene)

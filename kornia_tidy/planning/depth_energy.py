@@ -17,9 +17,13 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
+
+from kornia_tidy.render.borders import cropped, extended
 
 LEVELS = 5  # octaves from 2 px to 32; lower frequencies share one more
 REACHES = (1, 3, 9)  # candidate spreads of a PSF, in cells; the one with the largest power counts
@@ -77,34 +81,21 @@ class Depths:
         full = count > 0
         self.psi, self.share = sums[full] / count[full], count[full].double() / at.numel()
         self._index = (full.cumsum(0) - 1)[index]
-        self._border, self._margin = border, margin
-        height, width = defocus.shape[-2:]
-        self._shape = height, width
-        self.seen = (height - 2 * margin) * (width - 2 * margin) / (height * width)
-        self._rows, self._columns = (_cells(side, border) for side in defocus.shape[-2:])
+        self._border = "reflect" if border == "valid" else border
+        self._rows, self._columns = (_whole_cells(side) for side in defocus.shape[-2:])
+        whole = torch.ones(1, 1, *defocus.shape[-2:])
+        inner = pad(cropped(whole, margin), (margin,) * 4)  # what the capture shows
+        self.seen = float(inner.mean())
+        self._image, self._shown = (extended(each, self._rows, self._columns, "zero") for each in (whole, inner))
 
-    def _laid_out(self, plane: Tensor, outside: float | Tensor) -> Tensor:
+    def _laid_out(self, plane: Tensor) -> Tensor:
         """Return planes (B, C, H, W) padded by the border mode to whole cells of the largest size."""
-        rows, columns = self._rows, self._columns
-        laid = plane[..., rows.clamp(min=0)[:, None], columns.clamp(min=0)]
-        if self._border != "zero":
-            return laid
-        return torch.where((rows[:, None] >= 0) & (columns >= 0), laid, outside)
-
-    def _once(self, margin: int) -> Tensor:
-        """Return the mask of the padded planes, (1, 1, H', W'): 1 on the image less a margin, 0 elsewhere."""
-        inside = torch.zeros(1, 1, len(self._rows), len(self._columns))
-        height, width = self._shape
-        top, left = _OFFSET + margin, _OFFSET + margin
-        inside[..., top : _OFFSET + height - margin, left : _OFFSET + width - margin] = 1
-        return inside
+        return extended(plane, self._rows, self._columns, self._border)
 
     def _labels(self, batch: int, foremost: bool = False) -> Tensor:
-        """Return the bin of each pixel of the padded planes, (B, 1, H', W'); outside, the number of bins."""
-        outside, index = torch.tensor(len(self.psi)), self._index
-        if foremost:
-            index = max_pool2d(index.double(), 3, 1, 1).long()
-        return self._laid_out(index, outside).expand(batch, -1, -1, -1)
+        """Return one more than the bin of each pixel of the padded planes, (B, 1, H', W'); outside, zero."""
+        index = max_pool2d(self._index.double(), 3, 1, 1).long() if foremost else self._index
+        return self._laid_out(index + 1).expand(batch, -1, -1, -1)
 
     def shares(self, light: Tensor) -> Tensor:
         r"""Return the share of each octave's power within reach of the pixels at each depth, for gather.
@@ -121,10 +112,8 @@ class Depths:
         """
         light = light.detach().cpu()
         mean = light.mean((-2, -1), keepdim=True)
-        averages = self._laid_out(light - mean, -mean)
-        labels = self._labels(len(light))
-        labels = torch.where(self._once(self._margin) > 0, labels, len(self.psi))
-        labels = labels.flatten()
+        averages = self._laid_out(light) - mean
+        labels = torch.where(self._shown > 0, self._labels(len(light)), 0).flatten()
         alone = self._largest(averages.square(), 1, labels, (1,))  # a single point of light is part of all octaves
         octaves = []
         for level in range(LEVELS + 1):
@@ -138,7 +127,7 @@ class Depths:
 
     def _largest(self, squares: Tensor, side: int, labels: Tensor, reaches: Sequence[int] = REACHES) -> Tensor:
         """Return the largest share of each bin in the power over all reaches, (C, b), for cells of a given side."""
-        inside = avg_pool2d(self._once(0), side)
+        inside = avg_pool2d(self._image, side)
         total = (squares * inside).sum((0, 2, 3)).double()[:, None]
         count = len(self.psi)
         largest = torch.zeros(squares.shape[1], count, dtype=torch.float64)
@@ -149,7 +138,7 @@ class Depths:
                     own, cell = avg_pool2d(own, _REACH_CELL // side), _REACH_CELL
                 own = avg_pool2d(own, reach, 1, reach // 2, count_include_pad=False)
             spread = own.repeat_interleave(cell, -2).repeat_interleave(cell, -1).transpose(0, 1).flatten(1)
-            sums = spread.new_zeros(count + 1, len(spread)).index_add_(0, labels, spread.T).T[:, :count]
+            sums = spread.new_zeros(count + 1, len(spread)).index_add_(0, labels, spread.T).T[:, 1:]
             largest = torch.maximum(largest, sums.double() / side**2 / total)
         return torch.where(total > 0, largest.clamp(max=1), self.share)
 
@@ -173,24 +162,23 @@ class Depths:
         Returns:
             (C, levels + 1, b, b) float64, a mean over pixels; of the last octave less that of the means.
         """
-        light = light.detach().float().cpu()
-        count = len(self.psi)
-        planes = self._laid_out(light, 0.0).transpose(0, 1)
+        light = light.detach().double().cpu()
+        planes = self._laid_out(light).transpose(0, 1)
         labels = self._labels(len(light), foremost)[:, 0]
-        inside = (labels[:1, None] < count).float()
+        inside = (labels[:1, None] > 0).double()
         covered = avg_pool2d(inside, 2**LEVELS)[0]
         drawn_out = self._border == "replicate"  # the replicated border adds to the light of the image
-        pixels = len(light) * (self._shape[0] * self._shape[1] if drawn_out else float(inside.sum()))
+        pixels = len(light) * float((self._image if drawn_out else inside).sum())
         rows = 2**LEVELS * max(1, _STRIP // (2**LEVELS * labels.shape[0] * labels.shape[-1]))
         products = []
         for plane in planes:
             strips = [
-                _products_of_cells(*strip, count)
+                _products_of_cells(*strip, len(self.psi))
                 for strip in zip(plane.split(rows, 1), labels.split(rows, 1), strict=True)
             ]
             levels = torch.stack([levels for levels, _ in strips]).sum(0)
             cells = torch.cat([cells for _, cells in strips], 1)
-            slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2).double()
+            slow = (cells - covered[..., None] * cells.sum((1, 2), keepdim=True) / covered.sum()).flatten(0, 2)
             levels = torch.cat([-levels.diff(dim=0), (slow.T @ slow)[None] / 4**LEVELS])
             products.append(levels / pixels)
         return torch.stack(products)
@@ -211,51 +199,28 @@ def brightest_around(light: Tensor) -> Tensor:
     return cells.repeat_interleave(side, -2)[..., :height, :].repeat_interleave(side, -1)[..., :width]
 
 
-def _cells(side: int, border: str) -> Tensor:
-    """Return the image row of each row of the padded planes, -1 for none."""
-    whole = 2**LEVELS * math.ceil((side + _OFFSET) / 2**LEVELS)
-    at = torch.arange(whole) - _OFFSET
-    if border == "zero":
-        return torch.where((at >= 0) & (at < side), at, -1)
-    if border == "circular":
-        return at % side
-    if border == "replicate":
-        return at.clamp(0, side - 1)
-    period = max(1, 2 * side - 2)
-    at = at % period
-    return torch.minimum(at, period - at)
+def _whole_cells(side: int) -> tuple[int, int]:
+    """Return the first row of the padded planes, and the one beyond the last."""
+    return -_OFFSET, 2**LEVELS * math.ceil((side + _OFFSET) / 2**LEVELS) - _OFFSET
 
 
 def _products_of_cells(plane: Tensor, labels: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the inner products of cell sums at each level, (levels + 1, b, b), and the sums over the largest cells."""
-    levels = [_products_at(plane, labels, level, count) for level in range(2)]
-    cells = _cell_sums(plane, labels, 2, count)
-    for level in range(2, LEVELS + 1):
-        levels.append((cells.flatten(0, 2).T @ cells.flatten(0, 2)).double() / 4**level)
-        if level < LEVELS:
-            cells = cells.unflatten(1, (-1, 2)).unflatten(3, (-1, 2)).sum((2, 4))
-    return torch.stack(levels), cells
+    """Return the inner products of cell sums at each level, (levels + 1, b, b), and the sums over the largest cells.
 
-
-def _products_at(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
-    """Return the inner products of cell sums at a fine level, accumulated over pairs of pixels in a cell."""
-    side = 2**level
-    light, own = (_in_cells(each, side) for each in (plane, labels))
-    pairs = own[:, :, None] * (count + 1) + own[:, None]
-    weights = light[:, :, None] * light[:, None]
-    sums = torch.bincount(pairs.flatten(), weights.flatten(), minlength=(count + 1) ** 2)
-    return sums.double().view(count + 1, count + 1)[:count, :count] / 4**level
-
-
-def _in_cells(plane: Tensor, side: int) -> Tensor:
-    return plane.unflatten(1, (-1, side)).unflatten(3, (-1, side)).transpose(2, 3).flatten(3).flatten(0, 2)
-
-
-def _cell_sums(plane: Tensor, labels: Tensor, level: int, count: int) -> Tensor:
-    """Return the sum of the light at each depth in each cell, (B, rows, columns, b)."""
-    batch, height, width = (len(plane), *(side >> level for side in plane.shape[-2:]))
-    rows, columns = torch.arange(height << level) >> level, torch.arange(width << level) >> level
-    cells = (torch.arange(batch)[:, None, None] * height + rows[:, None]) * width + columns
-    sums = torch.zeros(batch * height * width * (count + 1), dtype=plane.dtype)
-    sums.index_add_(0, (cells * (count + 1) + labels).flatten(), plane.flatten())
-    return sums.view(batch, height, width, count + 1)[..., :count]
+    Args:
+        plane: (B, H', W') light.
+        labels: the same of labels, from 1 to the count; outside, 0.
+        count: number of bins b.
+    """
+    width, at = plane.shape[-1], labels.flatten().nonzero().flatten()
+    where = at.numpy(), labels.flatten()[at].numpy() - 1
+    cells, levels = csr_array((plane.flatten()[at].numpy(), where), (plane.numel(), count)), []
+    for level in range(LEVELS + 1):
+        if level:
+            found = cells.tocoo()
+            row, column = np.divmod(found.row, width)
+            width //= 2
+            cells = csr_array((found.data, (row // 2 * width + column // 2, found.col)), (cells.shape[0] // 4, count))
+        levels.append(torch.from_numpy((cells.T @ cells).toarray()) / 4**level)
+    largest = torch.from_numpy(cells.toarray()).view(len(plane), plane.shape[1] >> LEVELS, width, count)
+    return torch.stack(levels), largest

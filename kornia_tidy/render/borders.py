@@ -54,6 +54,36 @@ def pad_border(image: Tensor, radius: int | tuple[int, int], border: str) -> Ten
     return torch.nn.functional.pad(image, (across, across, down, down), mode=_PAD_MODES[border])
 
 
+def extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], border: str) -> Tensor:
+    """Return rows and columns of an image that reach beyond it, however far; ``valid`` repeats what nobody looks at.
+
+    Args:
+        image: (..., H, W).
+        rows: first row, and the one beyond the last.
+        columns: the same.
+        border: what lies beyond the image.
+
+    Example:
+        >>> extended(torch.arange(3)[None], (0, 1), (-3, 5), "reflect")
+        tensor([[1, 2, 1, 0, 1, 2, 1, 0]])
+    """
+    for axis, (first, last) in ((-2, rows), (-1, columns)):
+        side = image.shape[axis]
+        at = torch.arange(first, last, device=image.device)
+        outside = (at < 0) | (at >= side)
+        if border == "reflect":
+            period = max(1, 2 * side - 2)
+            at = at.remainder(period)
+            at = torch.minimum(at, period - at)
+        elif border == "circular":
+            at = at.remainder(side)
+        image = image.index_select(axis, at.clamp(0, side - 1))
+        if border == "zero":
+            shape = (-1, 1) if axis == -2 else (-1,)
+            image = image * (~outside).to(image.dtype).view(shape)
+    return image
+
+
 def cropped(tensor: Tensor, margin: int) -> Tensor:
     """Return a map without so many pixels on each side.
 

@@ -29,8 +29,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
 from kornia_tidy.psf.pieces import Piece
-from kornia_tidy.render.borders import cropped, next_fast_size
+from kornia_tidy.render.borders import cropped, extended, next_fast_size
 from kornia_tidy.render.compositing import Bank, gather
+from kornia_tidy.render.layers import assign_layers
 
 _SHARPENED = 1 / 6  # half of the variance that averaging and interpolating add on each axis
 _LAYER_BYTES = 64 << 20  # of the layers held at a time
@@ -72,7 +73,7 @@ def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str
     radius, nodes = bank.psfs.shape[-1] // 2, bank.defocus
     height, width = seen.shape[-2:]
     rows, columns = ((margin - radius, side + margin + radius) for side in (height, width))
-    plane = _extended(image, rows, columns, border)
+    plane = extended(image, rows, columns, border)
     beyond = pad(seen, (radius,) * 4)  # not looked at
     return gather(plane, beyond, nodes, bank.psfs, border="valid")
 
@@ -84,7 +85,7 @@ def _on_grid(
     bank, grid = group.bank(), group.grid
     radius = bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
     rows, columns = ((margin - radius * grid, margin + (-(-side // grid) + radius) * grid) for side in seen.shape[-2:])
-    plane = avg_pool2d(_extended(image, rows, columns, border), grid)
+    plane = avg_pool2d(extended(image, rows, columns, border), grid)
     psfs, nodes = _sharpened(bank.psfs.to(plane.dtype)), bank.defocus.to(seen)
     size, lost = [next_fast_size(side) for side in plane.shape[-2:]], psfs.shape[-1] - 1
     spectrum = torch.fft.rfft2(plane, s=size)
@@ -99,9 +100,13 @@ def _on_grid(
         for b in range(len(image)):
             of_scene = b if len(seen) > 1 else 0
             pixels = inside[of_scene].flatten().nonzero().flatten()
-            row, column = pixels // seen.shape[-1], pixels % seen.shape[-1]
-            layer = _layer_of(seen[of_scene].flatten()[pixels], nodes[chunk])
-            yield b, pixels, _interpolated(layers[b], layer, (row + 0.5) / grid + 0.5, (column + 0.5) / grid + 0.5)
+            row, column = ((at + 0.5) / grid + 0.5 for at in (pixels // seen.shape[-1], pixels % seen.shape[-1]))
+            index, weight = assign_layers(seen[of_scene].flatten()[pixels], nodes[chunk], "linear")
+            yield (
+                b,
+                pixels,
+                _interpolated(layers[b], index + weight, row, column),
+            )
 
 
 def _between(defocus: Tensor, nodes: Tensor, chunk: slice) -> Tensor:
@@ -112,15 +117,6 @@ def _between(defocus: Tensor, nodes: Tensor, chunk: slice) -> Tensor:
     if chunk.stop < len(nodes):
         inside &= defocus < nodes[chunk.stop - 1]
     return inside
-
-
-def _layer_of(defocus: Tensor, nodes: Tensor) -> Tensor:
-    """Return the layer of each pixel as a real number between 0 and the last one."""
-    if len(nodes) == 1:
-        return torch.zeros_like(defocus)
-    clamped = defocus.clamp(nodes[0], nodes[-1])
-    index = torch.bucketize(clamped.detach(), nodes[1:-1].contiguous(), right=True)
-    return index + (clamped - nodes[index]) / nodes.diff()[index]
 
 
 def _interpolated(layers: Tensor, layer: Tensor, row: Tensor, column: Tensor) -> Tensor:
@@ -137,22 +133,3 @@ def _sharpened(psfs: Tensor) -> Tensor:
     middle = wide[..., 1:-1, 1:-1]
     around = wide[..., :-2, 1:-1] + wide[..., 2:, 1:-1] + wide[..., 1:-1, :-2] + wide[..., 1:-1, 2:]
     return middle - _SHARPENED * (around - 4 * middle)
-
-
-def _extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], border: str) -> Tensor:
-    """Return rows and columns of an image that reach beyond it; ``"valid"`` repeats what nobody looks at."""
-    for axis, (first, last) in ((-2, rows), (-1, columns)):
-        side = image.shape[axis]
-        at = torch.arange(first, last, device=image.device)
-        outside = (at < 0) | (at >= side)
-        if border == "reflect":
-            period = max(1, 2 * side - 2)
-            at = at.remainder(period)
-            at = torch.minimum(at, period - at)
-        elif border == "circular":
-            at = at.remainder(side)
-        image = image.index_select(axis, at.clamp(0, side - 1))
-        if border == "zero":
-            shape = (-1, 1) if axis == -2 else (-1,)
-            image = image * (~outside).to(image.dtype).view(shape)
-    return image
