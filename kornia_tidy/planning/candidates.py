@@ -15,10 +15,7 @@ LAYER_SPACINGS = {
     "bandlimited": (2.0, 1.0),
 }
 PIXEL_TOLERANCES = (1e-1, 2e-2, 1e-3, 1e-6)
-WINDOW_STRAY_LIGHT = (
-    "veil",
-    "renormalize",
-)  # the better one depends on window and image
+WINDOW_STRAY_LIGHT = ("veil", "renormalize")  # the better one depends on window and image
 RATIO = 1.2  # between successive candidates of the window and of the number of wavelengths
 
 

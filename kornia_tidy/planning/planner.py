@@ -135,8 +135,7 @@ class PlannedScene:
 
     def operations(self, fidelity: Fidelity) -> float:
         """Return the operations of a capture with its PSFs, those of float64 counted twice."""
-        bank = self._bank_work(fidelity, self._computed(fidelity.layers, fidelity.layer_spacing))
-        return self.planner.captures * (bank.operations + self._work(fidelity).operations)
+        return self.planner.captures * sum(work.operations for work in self._works(fidelity))
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -172,9 +171,9 @@ class PlannedScene:
         yield None
 
     def _described(self, fidelity: Fidelity, tolerance: float) -> RenderPlan:
-        planner, kind = self.planner, (fidelity.layers, fidelity.layer_spacing)
-        computed = self._computed(*kind)
-        held = planner.captures * max(computed, len(nodes_around(self._rendered(fidelity), self._defocus)))
+        planner, (bank, rendering) = self.planner, self._works(fidelity)
+        layers = self._layers(fidelity.layers, fidelity.layer_spacing)
+        held = planner.captures * max(1.0, len(nodes_around(self._rendered(fidelity), self._defocus)) / layers[0])
         return RenderPlan(
             fidelity=fidelity,
             reference=self.reference,
@@ -183,8 +182,8 @@ class PlannedScene:
             error_parts=tuple(self._parts(fidelity)),
             operations=self.operations(fidelity),
             reference_operations=self.operations(self.reference),
-            memory_bytes=max(self._bank_work(fidelity, held).memory, self._work(fidelity).memory),
-            layers=(computed, len(planner.sampled(*kind))),
+            memory_bytes=max(round(held * bank.memory), rendering.memory),
+            layers=layers,
             window=window_side(fidelity),
             wavelengths=(len(planner.spectrum_of(fidelity).wavelengths), len(planner.spectrum.wavelengths)),
             states=planner.captures,
@@ -219,11 +218,8 @@ class PlannedScene:
 
     @remembered
     def _layer_error(self, layers: str, spacing: float) -> float:
-        kinds = (layers, spacing), (REFERENCE.layers, REFERENCE.layer_spacing)
-        if kinds[0] == kinds[1]:
-            return 0.0
-        own, theirs = (self._layered(*kind) for kind in kinds)
-        return change_error(self._at, own - theirs, self.light, alternate=True)
+        reference = self._layered(REFERENCE.layers, REFERENCE.layer_spacing)
+        return change_error(self._at, self._layered(layers, spacing) - reference, self.light, alternate=True)
 
     @remembered
     def _window_error(self, window: int, stray_light: str) -> float:
@@ -239,8 +235,6 @@ class PlannedScene:
 
     @remembered
     def _point_error(self, tolerance: float) -> float:
-        if tolerance <= REFERENCE.pixel_tolerance:
-            return 0.0
         return change_error(self._at, self._sampled(tolerance) - self._sampled(REFERENCE.pixel_tolerance), self.light)
 
     @remembered
@@ -340,26 +334,25 @@ class PlannedScene:
     # ---------------------------------------------------------------------- costs
 
     @remembered
-    def _computed(self, layers: str, spacing: float) -> int:
-        """Return the number of PSFs computed for the scene: all layers from its farthest to its nearest."""
+    def _layers(self, layers: str, spacing: float) -> tuple[int, int]:
+        """Return how many PSFs are computed for the scene, from its farthest to its nearest, and of the whole range."""
         nodes = self.planner.nodes(layers, spacing)
-        weights, _ = layer_coefficients(self._depths.psi[[0, -1]], nodes, layers, self.planner.band)
+        weights, sampled = layer_coefficients(self._depths.psi[[0, -1]], nodes, layers, self.planner.band)
         used = torch.nonzero((weights != 0).any(0)).flatten()
-        return int(used[-1] - used[0] + 1)
-
-    def _bank_work(self, fidelity: Fidelity, layers: int) -> Work:
-        planner = self.planner
-        return bank_work(planner.model, planner.spectrum_of(fidelity), planner.together, fidelity, layers)
+        return int(used[-1] - used[0] + 1), len(sampled)
 
     def _rendered(self, fidelity: Fidelity) -> tuple[float, ...]:
         """Return the defocus of the rendered layers."""
         nodes = self.planner.nodes(fidelity.layers, fidelity.layer_spacing)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
-    def _work(self, fidelity: Fidelity) -> Work:
-        """Return the work of the renderer for the scene."""
+    def _works(self, fidelity: Fidelity) -> tuple[Work, Work]:
+        """Return the work of a bank of PSFs and of the renderer, for one capture of the scene."""
+        planner, (computed, _) = self.planner, self._layers(fidelity.layers, fidelity.layer_spacing)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        return self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
+        rendering = self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
+        spectrum = planner.spectrum_of(fidelity)
+        return bank_work(planner.model, spectrum, planner.together, fidelity, computed), rendering
 
     @remembered
     def _rendering(self, layers: str, nodes: tuple[float, ...], window: int, double: bool) -> Work:

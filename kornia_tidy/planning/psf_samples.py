@@ -17,7 +17,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.planning.candidates import REFERENCE, wavelength_steps
 from kornia_tidy.planning.costs import window_side
 from kornia_tidy.planning.error_model import layer_coefficients
-from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, guarded
+from kornia_tidy.psf.defocus_interpolation import defocus_band
 from kornia_tidy.psf.lens_limits import check_defocus_range
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.spectral_binning import bin_spectrum
@@ -80,11 +80,6 @@ class PSFSamples:
     def nodes(self, layers: str, spacing: float) -> tuple[float, ...]:
         """Return the defocus of layers of a kind and spacing."""
         return self.model.with_fidelity(replace(REFERENCE, layers=layers, layer_spacing=spacing)).defocus_nodes
-
-    def sampled(self, layers: str, spacing: float) -> Sequence[float]:
-        """Return the defocus of the PSFs that are computed for layers of a kind and spacing."""
-        nodes = self.nodes(layers, spacing)
-        return guarded(nodes, TAPS[layers] // 2) if layers in TAPS else nodes
 
     def reference(self, height: int, width: int) -> Fidelity:
         """Return the reference for images of this size, its window fixed: that of wide blur, where it is."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.planning.depth_energy import LEVELS, Depths, brightest_around, octave_filters
 from kornia_tidy.render.borders import next_fast_size, pad_border
+from kornia_tidy.render.stray_light import pixels_around
 
 CONTRAST = 0.3  # standard deviation of light assumed without an image, full scale 1; photographs have 0.13 to 0.35
 GRID_RATIO = 2.0  # side of the frequency grid over the window: the autocorrelation of a PSF then does not wrap around
@@ -64,11 +65,9 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
 
 def _dark_square(shape: Sequence[int], radius: int) -> float:
     """Return the mean square, over pixels, of the share of the surrounding window that lies beyond the image."""
-    inside = []
-    for side in shape:
-        at = torch.arange(side, dtype=torch.float64)
-        inside.append(((at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1) / (2 * radius + 1))
-    return float((1 - inside[0][:, None] * inside[1]).square().mean())
+    reach = torch.tensor([float(radius)], dtype=torch.float64)
+    down, across = (pixels_around(side, reach) / (2 * radius + 1) for side in shape)
+    return float((1 - down @ across.mT).square().mean())
 
 
 def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
@@ -78,7 +77,7 @@ def _power_of_blocks(light: Tensor, border: str, size: int) -> Tensor:
             block = light[..., top : top + _BLOCK, left : left + _BLOCK]
             total = total + _covariance(_endless(block, border, size), size) * block[0, 0].numel()
             pixels += block[0, 0].numel()
-    return _half_plane(torch.fft.rfft2(total / pixels).real / size**2, size)
+    return torch.fft.rfft2(total / pixels).real * (_of_two(size) / size**2)
 
 
 def coarser(power: Tensor, size: int) -> Tensor:
@@ -90,13 +89,9 @@ def coarser(power: Tensor, size: int) -> Tensor:
         torch.Size([1, 10, 6])
     """
     full = power.shape[-2]
-    halves = torch.full((full // 2 + 1,), 0.5, dtype=torch.float64)
-    halves[0] = 1
-    if full % 2 == 0:
-        halves[-1] = 1
-    covariance = torch.fft.irfft2(power * halves, s=(full, full))
+    covariance = torch.fft.irfft2(power / _of_two(full), s=(full, full))
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
-    return _half_plane(torch.fft.rfft2(covariance[:, lags[:, None], lags]).real * (full / size) ** 2, size)
+    return torch.fft.rfft2(covariance[:, lags[:, None], lags]).real * ((full / size) ** 2 * _of_two(size))
 
 
 def natural_power(channels: int, size: int) -> Tensor:
@@ -114,7 +109,7 @@ def natural_power(channels: int, size: int) -> Tensor:
     down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
     squared = down[:, None] ** 2 + across**2
     squared[0, 0] = (0.5 / size) ** 2
-    power = _half_plane(1 / squared[None], size)
+    power = _of_two(size) / squared[None]
     return (power * (CONTRAST**2 / power.sum())).expand(channels, -1, -1)
 
 
@@ -236,20 +231,16 @@ def _endless(block: Tensor, border: str, size: int) -> Tensor:
 def _covariance(plane: Tensor, size: int) -> Tensor:
     """Return the autocovariance of a periodic plane at shifts up to half of ``size``, (C, size, size)."""
     height, width = plane.shape[-2:]
-    power = _power(torch.fft.rfft2(plane)).mean(0) / (height * width)
+    power = torch.fft.rfft2(plane).abs().square().mean(0) / (height * width)
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
     rows = torch.fft.ifft(power, dim=-2)[:, lags % height]
     return torch.fft.irfft(rows, n=width)[..., lags % width].cpu()
 
 
-def _power(spectrum: Tensor) -> Tensor:
-    return spectrum.real.square() + spectrum.imag.square()
-
-
-def _half_plane(power: Tensor, size: int) -> Tensor:
-    """Double the columns of a half spectrum that represent two frequencies."""
+def _of_two(size: int) -> Tensor:
+    """Return how many frequencies each column of a half spectrum represents."""
     twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
     twice[0] = 1
     if size % 2 == 0:
         twice[-1] = 1
-    return power * twice
+    return twice

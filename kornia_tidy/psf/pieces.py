@@ -23,7 +23,7 @@ from kornia_tidy.kernels.window_sides import next_fast_size
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.psf.psf_cache import nodes_around, present_intervals
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
@@ -219,12 +219,7 @@ def _check_wide_bytes(blur: WideBlur, channels: int, dtype: torch.dtype, composi
 
 def _runs(nodes: tuple[float, ...], scene: Tensor, most: int) -> Iterator[tuple[float, float]]:
     """Yield the first and last node of each run of layers that hold pixels of a scene: (2,) or a map."""
-    inner = torch.tensor(nodes[1:-1], dtype=torch.float64, device=scene.device)
-    interval = torch.bucketize(scene.detach().double().contiguous(), inner, right=True)
-    present = torch.bincount(interval.flatten(), minlength=len(nodes) - 1) > 0
-    if scene.ndim == 1:
-        present[int(interval.min()) : int(interval.max()) + 1] = True
-    for first, last in runs_of(present.tolist(), most):
+    for first, last in runs_of(present_intervals(nodes, scene), most):
         yield nodes[first], nodes[last]
 
 

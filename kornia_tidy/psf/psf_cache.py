@@ -108,6 +108,27 @@ def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]
     return nodes[min(first, last) : last + 1]
 
 
+def present_intervals(nodes: tuple[float, ...], defocus: Tensor) -> list[bool]:
+    """Return for each interval between nodes whether defocus lies in it; the outermost reach to infinity.
+
+    Args:
+        nodes: ascending.
+        defocus: map in radians, or its lowest and highest value, (2,), between which everything counts.
+
+    Example:
+        >>> present_intervals((0.0, 1.0, 2.0, 3.0), torch.tensor([[-5.0, 2.5]]))
+        [True, False, True]
+        >>> present_intervals((0.0, 1.0, 2.0, 3.0), torch.tensor([-5.0, 2.5]))
+        [True, True, True]
+    """
+    inner = torch.tensor(nodes[1:-1], dtype=torch.float64, device=defocus.device)
+    interval = torch.bucketize(defocus.detach().double().contiguous(), inner, right=True).flatten()
+    present = torch.bincount(interval, minlength=len(nodes) - 1) > 0
+    if defocus.ndim == 1:
+        present[int(interval.min()) : int(interval.max()) + 1] = True
+    return present.tolist()
+
+
 def plain_attributes(*parts: nn.Module) -> list[Any]:
     """Return the types and attributes of modules and submodules, but no parameters, buffers or hooks, to be compared.
 

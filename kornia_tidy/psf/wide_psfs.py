@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.psf.psf_cache import present_intervals
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.psf.wide_blur import BlurGroup, WideBlur
 
@@ -44,19 +43,14 @@ def wide_psfs(
         nodes: defocus in radians, ascending.
         like: a tensor of the PSFs' type and device.
     """
-    small = tuple(psi for psi in nodes if blur_radius(psi, step) < blur.ray_radius)
-    far = tuple(psi for psi in nodes if psi < 0 and psi not in small)
-    near = tuple(psi for psi in nodes if psi > 0 and psi not in small)
-    parts = []
-    for span in (far, near):
-        psfs = like.new_zeros(len(span), len(shares), window, window)
-        if span:
-            rays = geometric_psfs(pupil.transmission.to(like.device), pupil.cell_pitch, span, step * grid, window)
-            psfs = psfs + rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
-        parts.append(psfs)
+    by_waves = torch.tensor([blur_radius(psi, step) < blur.ray_radius for psi in nodes], device=like.device)
+    psfs, at = like.new_empty(len(nodes), len(shares), window, window), torch.tensor(nodes, dtype=torch.float64)
+    small, large = (tuple(at[which.cpu()].tolist()) for which in (by_waves, ~by_waves))
     if small:
-        parts.insert(1, exact(small, window).psfs)
-    psfs = torch.cat(parts)
+        psfs[by_waves] = exact(small, window).psfs
+    if large:
+        rays = geometric_psfs(pupil.transmission.to(like.device), pupil.cell_pitch, large, step * grid, window)
+        psfs[~by_waves] = rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
     return PSFBank(psfs, psfs.new_tensor(nodes), psfs.sum((2, 3)))
 
 
@@ -67,19 +61,10 @@ def held_nodes(blur: WideBlur, defocus: Tensor) -> list[tuple[BlurGroup, tuple[f
         blur: the lens.
         defocus: map in radians, or its lowest and highest value, (2,), between which everything counts.
     """
-    nodes = blur.nodes
-    if defocus.ndim == 1:
-        around = nodes_around(nodes, defocus)
-        first = min(nodes.index(around[0]), len(nodes) - 2)
-        present = set(range(first, max(first + 1, nodes.index(around[-1]))))
-    else:
-        inner = defocus.new_tensor(nodes[1:-1], dtype=torch.float64)
-        index = torch.bucketize(defocus.detach().double().contiguous(), inner, right=True)
-        present = set(torch.bincount(index.flatten(), minlength=len(nodes) - 1).nonzero().flatten().tolist())
-    found = []
+    present, found = present_intervals(blur.nodes, defocus), []
     for group in blur.groups:
-        start = bisect_right(nodes, group.nodes[0]) - 1
-        own = [i for i in range(len(group.nodes) - 1) if start + i in present]
+        first = blur.nodes.index(group.nodes[0])
+        own = [i for i in range(len(group.nodes) - 1) if present[first + i]]
         if own:
             found.append((group, tuple(group.nodes[i] for i in sorted({i + k for i in own for k in (0, 1)}))))
     return found

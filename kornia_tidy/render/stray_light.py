@@ -60,12 +60,17 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
     density = -beyond.diff() / (2 * ring + 1).square().diff()
     # Squares of pixels, each with the step by which the density falls at its edge, add up to rings of even density.
     steps = torch.cat([-density[:1], -density.diff(), density[-1:]])
-    down, across = (_pixels_around(side, ring) for side in (height, width))
+    down, across = (pixels_around(side, ring) for side in (height, width))
     return (down * steps) @ across.mT
 
 
-def _pixels_around(side: int, radius: Tensor) -> Tensor:
-    """(side, K) number of pixels of a line at most so far from each of its pixels."""
+def pixels_around(side: int, radius: Tensor) -> Tensor:
+    """Return how many pixels of a line lie at most so far from each of its pixels, (side, K), for K radii.
+
+    Example:
+        >>> pixels_around(3, torch.tensor([1.0])).flatten().tolist()
+        [2.0, 3.0, 2.0]
+    """
     at = torch.arange(side, dtype=torch.float64, device=radius.device)[:, None]
     return (at + radius).clamp(max=side - 1) - (at - radius).clamp(min=0) + 1
 
