@@ -24,6 +24,7 @@ from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.render.borders import check_border, largest_window
 
 _TOLERANCE = 0.3  # pixel tolerance of the samples: some per cent suffice for differences of PSFs
+_LARGEST_REMEMBERED = 129  # px; layers of all kinds take hundreds of PSFs, and share many
 _WAVELENGTHS = 7  # at most, in the samples: PSFs then have errors of half a per cent
 
 
@@ -117,17 +118,20 @@ class PSFSamples:
     @torch.no_grad()
     def layered(self, layers: str, spacing: float, depths: Sequence[float], window: int) -> Tensor:
         """Return the PSFs that layers of a kind and spacing give to pixels at some depths, (D, C, P, P)."""
+        if window > _LARGEST_REMEMBERED and len(depths) > 1:  # a depth of band-limited layers takes a dozen of them
+            return torch.cat([self.layered(layers, spacing, [psi], window) for psi in depths])
         psi = torch.tensor(depths, dtype=torch.float64)
         weights, at = layer_coefficients(psi, self.nodes(layers, spacing), layers, self.band)
         used = (weights != 0).any(0)
         nodes = tuple(psi for psi, needed in zip(at, used.tolist(), strict=True) if needed)
-        psfs = self._narrow(window).psf_bank(self.channels, torch.float64, nodes).psfs.cpu()
+        psfs = self._sampling(window).psf_bank(self.channels, torch.float64, nodes).psfs.cpu()
         return (weights[:, used] @ psfs.flatten(1)).unflatten(1, psfs.shape[1:])
 
     @remembered
-    def _narrow(self, window: int) -> PSFModel:
-        """Return a model that remembers its PSFs: layers of different spacing share many of their depths."""
-        return copy(self._model(window, _TOLERANCE, max(self._fewest, _WAVELENGTHS)))
+    def _sampling(self, window: int) -> PSFModel:
+        """Return a model of PSFs between which layers are compared; a copy has a memory of its own."""
+        model = self._model(window, _TOLERANCE, max(self._fewest, _WAVELENGTHS))
+        return model.without_memory() if window > _LARGEST_REMEMBERED else copy(model)
 
     @torch.no_grad()
     def binned(self, count: int | None, depths: Sequence[float], window: int) -> Tensor:

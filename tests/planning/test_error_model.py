@@ -109,6 +109,19 @@ class TestLayers(BaseTester):
             coded = render(point, psi.expand(1, 1, 15, 15), bank, layers=mode, border="zero")
         self.assert_close(coded, psf, atol=1e-12, rtol=0)
 
+    def test_feature_large_psfs_are_made_for_a_depth_at_a_time(self, monkeypatch):
+        """And not remembered; they are the same."""
+        optics, depths = TiDyOptics(PixelwiseMask(1), sensor=None), (-7.3, 0.2, 11.0)
+        at_once = PSFSamples(optics, 3).layered("cubic", 1.0, depths, 15)
+        monkeypatch.setattr("kornia_tidy.planning.psf_samples._LARGEST_REMEMBERED", 13)
+        self.assert_close(PSFSamples(optics, 3).layered("cubic", 1.0, depths, 15), at_once, rtol=0, atol=1e-12)
+
+    def test_feature_a_pixel_of_a_very_wide_range_takes_the_layers_around_it(self):
+        """The weights of all its fine layers would be some gigabytes."""
+        psi = torch.tensor([-7.3, 4321.0], dtype=torch.float64)
+        weights, at = layer_coefficients(psi, tuple(map(float, range(-10_000, 10_001))), "bandlimited", 1.2)
+        self.assert_close(weights @ torch.tensor(at, dtype=torch.float64), psi, rtol=0, atol=0.01)
+
     def test_feature_differences_are_those_of_convolved_images(self):
         generator = torch.Generator().manual_seed(0)
         light = torch.rand(1, 1, 24, 24, dtype=torch.float64, generator=generator)

@@ -62,6 +62,12 @@ class TestRenderingWork(BaseTester):
         assert rendering_work(psi, 2, 3, NODES, window, **options) == choose(scene).work(scene)
 
     @pytest.mark.parametrize("compositing", COMPOSITING)
+    def test_feature_it_is_counted_of_psfs_that_no_memory_would_hold(self, compositing):
+        """Behind a very fast lens the layers of the reference are many, and large."""
+        nodes = tuple(psi / 100 for psi in range(-100_000, 100_001))  # with 513 px some 600 GB
+        assert rendering_work(ramp(90, 120), 1, 3, nodes, 513, compositing=compositing, border="zero").operations > 0
+
+    @pytest.mark.parametrize("compositing", COMPOSITING)
     def test_feature_it_grows_with_channels_and_precision(self, compositing):
         def work(channels, **options):
             return rendering_work(ramp(256, 256), 1, channels, NODES, 41, compositing=compositing, **options)
