@@ -44,6 +44,7 @@ from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
+from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.stray_light import share_in_frame, share_within
 
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.3 times the formula
@@ -214,7 +215,7 @@ class PlannedScene:
     @remembered
     def _held(self, window: int) -> Tensor:
         """Return the share of the light in a window, at some depths of the scene, (D, C)."""
-        return _cropped(self._psfs, window).sum((-2, -1)).double()
+        return cropped(self._psfs, (self._full - window) // 2).sum((-2, -1)).double()
 
     @remembered
     def _layer_error(self, layers: str, spacing: float) -> float:
@@ -223,14 +224,14 @@ class PlannedScene:
 
     @remembered
     def _window_error(self, window: int, stray_light: str) -> float:
-        psfs = self._psfs
+        psfs, margin = self._psfs, (self._full - window) // 2
         if stray_light == "outlines":  # PSFs are normalised in both windows, with and without stray light
             psfs = psfs / psfs.sum((-2, -1), keepdim=True)
-        kept = _cropped(psfs, window)
+        kept = cropped(psfs, margin)
         if stray_light != "veil":
             kept = kept / kept.sum((-2, -1), keepdim=True)
         changes = -psfs
-        _cropped(changes, window).add_(kept)
+        cropped(changes, margin).add_(kept)
         return change_error(self._at, changes, self.light)
 
     @remembered
@@ -359,8 +360,3 @@ class PlannedScene:
         planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
         how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
         return rendering_work(*given, **how)
-
-
-def _cropped(psfs: Tensor, window: int) -> Tensor:
-    margin = (psfs.shape[-1] - window) // 2
-    return psfs[..., margin : margin + window, margin : margin + window]

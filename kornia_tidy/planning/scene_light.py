@@ -233,14 +233,9 @@ def _covariance(plane: Tensor, size: int) -> Tensor:
     height, width = plane.shape[-2:]
     power = torch.fft.rfft2(plane).abs().square().mean(0) / (height * width)
     lags = torch.fft.fftfreq(size, 1 / size).round().long()
-    rows = torch.fft.ifft(power, dim=-2)[:, lags % height]
-    return torch.fft.irfft(rows, n=width)[..., lags % width].cpu()
+    return torch.fft.irfft2(power, s=(height, width))[:, (lags % height)[:, None], lags % width].cpu()
 
 
 def _of_two(size: int) -> Tensor:
     """Return how many frequencies each column of a half spectrum represents."""
-    twice = torch.full((size // 2 + 1,), 2.0, dtype=torch.float64)
-    twice[0] = 1
-    if size % 2 == 0:
-        twice[-1] = 1
-    return twice
+    return torch.tensor([1.0] + [2.0] * ((size - 1) // 2) + [1.0] * (1 - size % 2), dtype=torch.float64)

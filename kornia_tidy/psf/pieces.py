@@ -131,9 +131,11 @@ def pieces_of(
     elif most is None:
         yield Piece(partial(make, source, defocus=reach), field=field)
     else:
-        for span in _runs(model.defocus_nodes, scene, most - 1):
-            own, ends = partial(make, source, defocus=torch.tensor(span, dtype=torch.float64)), model.defocus_nodes
-            yield Piece(own, span=_open_ended(span, ends), field=field, keep=False)
+        nodes = model.defocus_nodes
+        for first, last in runs_of(present_intervals(nodes, scene), most - 1):
+            own = partial(make, source, defocus=torch.tensor([nodes[first], nodes[last]], dtype=torch.float64))
+            span = -inf if first == 0 else nodes[first], inf if last == len(nodes) - 1 else nodes[last]
+            yield Piece(own, span=span, field=field, keep=False)
 
 
 def comes_in_pieces(model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int) -> bool:
@@ -215,14 +217,3 @@ def _check_wide_bytes(blur: WideBlur, channels: int, dtype: torch.dtype, composi
             f"some {needed / 2**30:.1f} GiB, of which memory_budget allows {budget / 2**30:.1f} GiB: take "
             f"compositing='gather', a smaller aperture, a narrower depth_range, or a larger memory_budget"
         )
-
-
-def _runs(nodes: tuple[float, ...], scene: Tensor, most: int) -> Iterator[tuple[float, float]]:
-    """Yield the first and last node of each run of layers that hold pixels of a scene: (2,) or a map."""
-    for first, last in runs_of(present_intervals(nodes, scene), most):
-        yield nodes[first], nodes[last]
-
-
-def _open_ended(span: tuple[float, float], nodes: tuple[float, ...]) -> tuple[float, float]:
-    """Return a span that takes in what lies beyond the outermost layers."""
-    return (-inf if span[0] == nodes[0] else span[0], inf if span[1] == nodes[-1] else span[1])
