@@ -54,21 +54,15 @@ def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: f
         >>> weights.tolist(), at
         ([[0.75, 0.25, 0.0]], (0.0, 2.0, 4.0))
     """
-    mode = "nearest" if layers == "nearest" else "linear"
-    taken_from = fine_nodes(nodes) if layers in TAPS else tuple(nodes)
-    at = torch.tensor(taken_from, dtype=torch.float64)
-    lower, fraction = (each.flatten() for each in assign_layers(psi.double().view(1, 1, 1, -1), at, mode))
-    if layers in TAPS:
-        samples, cut = guarded(nodes, TAPS[layers] // 2), band if layers == "bandlimited" else None
-        even = samples[0], samples[1] - samples[0], len(samples)
-        pairs = [fine_layer_matrix(*even, taken_from[low : low + 2], cut) for low in lower.tolist()]
-        below, above = torch.tensor(pairs, dtype=torch.float64).unbind(1)
-        return torch.lerp(below, above, fraction[:, None]), samples
-    weights = torch.zeros(len(psi), len(at), dtype=torch.float64)
-    row = torch.arange(len(psi))
-    weights[row, lower] = 1 - fraction
-    weights[row, (lower + 1).clamp(max=len(at) - 1)] += fraction
-    return weights, nodes
+    if layers not in TAPS:
+        return interpolation(psi, nodes, layers), nodes
+    fine, samples, cut = fine_nodes(nodes), guarded(nodes, TAPS[layers] // 2), band if layers == "bandlimited" else None
+    pixels, at = psi.double().view(1, 1, 1, -1), torch.tensor(fine, dtype=torch.float64)
+    lower, fraction = (each.flatten() for each in assign_layers(pixels, at, "linear"))
+    even = samples[0], samples[1] - samples[0], len(samples)
+    pairs = [fine_layer_matrix(*even, fine[low : low + 2], cut) for low in lower.tolist()]
+    below, above = torch.tensor(pairs, dtype=torch.float64).unbind(1)
+    return torch.lerp(below, above, fraction[:, None]), samples
 
 
 def change_error(nodes: Sequence[float], changes: Tensor, light: SceneLight, *, alternate: bool = False) -> float:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.planning.depth_energy import LEVELS, Depths, brightest_around, octave_filters
 from kornia_tidy.render.borders import next_fast_size, pad_border
+from kornia_tidy.render.layers import layer_weights
 from kornia_tidy.render.stray_light import pixels_around
 
 CONTRAST = 0.3  # standard deviation of light assumed without an image, full scale 1; photographs have 0.13 to 0.35
@@ -205,15 +205,15 @@ class SceneLight:
         return self._shapes[size]
 
 
-def interpolation(at: Tensor, nodes: Sequence[float]) -> Tensor:
-    """Return the weights of linear interpolation between nodes, constant beyond them, (len(at), len(nodes)).
+def interpolation(at: Tensor, nodes: Sequence[float], mode: str = "linear") -> Tensor:
+    """Return the weights of interpolation between nodes, constant beyond them, (len(at), len(nodes)).
 
     Example:
         >>> interpolation(torch.tensor([0.5, 9.0]), (0.0, 2.0)).tolist()
         [[0.75, 0.25], [0.0, 1.0]]
     """
-    columns = [np.interp(at.numpy(), nodes, row) for row in np.eye(len(nodes))]
-    return torch.as_tensor(np.stack(columns, 1), dtype=torch.float64)
+    weights = layer_weights(at.double().view(1, 1, 1, -1), torch.tensor(nodes, dtype=torch.float64), mode)
+    return weights[0, :, 0].T
 
 
 def _endless(block: Tensor, border: str, size: int) -> Tensor:
