@@ -20,6 +20,7 @@ from kornia_tidy.planning.error_model import layer_coefficients
 from kornia_tidy.psf.defocus_interpolation import defocus_band
 from kornia_tidy.psf.lens_limits import check_defocus_range
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf.psf_window import FittedWindow
 from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.render.borders import check_border, largest_window
 
@@ -137,13 +138,16 @@ class PSFSamples:
     def binned(self, count: int | None, depths: Sequence[float], window: int) -> Tensor:
         """Return PSFs with binned wavelengths, of each channel and basis reflectance, (D, C, B, P, P)."""
         spectrum = self.spectrum if count is None else bin_spectrum(self.spectrum, count)
-        planes, model = torch.zeros((), dtype=torch.float64), self._model(window, 1e-3, None).without_memory()
+        planes = torch.zeros((), dtype=torch.float64)
         for wavelength, shares in zip(spectrum.wavelengths, zip(*spectrum.plane_weights, strict=True), strict=True):
-            psfs = model.replace(spectrum=Spectrum.monochrome(wavelength)).psf_bank(1, torch.float64, depths).psfs.cpu()
+            one = self._model(window, 1e-3, None, spectrum=Spectrum.monochrome(wavelength))
+            psfs = one.without_memory().psf_bank(1, torch.float64, depths).psfs.cpu()
             planes = planes + psfs * torch.tensor(shares, dtype=torch.float64)[:, None, None]
         return planes.unflatten(1, (self.channels, -1))
 
-    def _model(self, window: int, tolerance: float, wavelengths: int | None) -> PSFModel:
+    def _model(self, window: int, tolerance: float, wavelengths: int | None, **parts: Any) -> PSFModel:
         """Return the model with PSFs in a window, before anything is done about stray light."""
         points = {"pixel_tolerance": tolerance, "wavelengths": wavelengths}
-        return self.model.with_fidelity(REFERENCE.replace(window=window, stray_light="discard", **points))
+        fidelity = REFERENCE.replace(window=window, stray_light="discard", **points)
+        # Nobody asks how much of the light it holds.
+        return self.model.replace(fidelity=fidelity, **parts).with_window(FittedWindow(window, (0.0, 1.0)))
