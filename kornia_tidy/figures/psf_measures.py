@@ -61,7 +61,7 @@ class PSFMeasures:
                 held, peak = 100 * float(self.psfs[d, c].sum()), 100 * float(self.psfs[d, c].max())
                 lines.append(
                     f"{depth:>9}  {psi:>+8.2f}  {name:>8}  {held:>4.1f} %  {peak:>5.2f} %  "
-                    f"{float(self.strehl[d, c]):>6.3f}  {_half_contrast(self.contrast[d, c])}"
+                    f"{float(self.strehl[d, c]):>6.3f}  {half_contrast(self.contrast[d, c])}"
                 )
         return lines
 
@@ -84,9 +84,9 @@ def measures_of_psfs(optics: TiDyOptics, defocus: Tensor) -> PSFMeasures:
     through = optics.psf_bank(defocus=focus.tolist()).psfs
     psi = tuple(round(each, 6) + 0.0 for each in defocus.flip(0).tolist())  # without a negative zero
     return PSFMeasures(
-        tuple(_in_metres(each, optics) for each in psi),
+        tuple(in_metres(each, optics) for each in psi),
         psi,
-        tuple(_channels(optics)),
+        tuple(channel_names(optics)),
         psfs,
         psfs.amax((2, 3)) / _without_mask(optics).amax((2, 3)),
         contrast_transfer(psfs / psfs.sum((2, 3), keepdim=True), FREQUENCIES),
@@ -105,14 +105,20 @@ def _without_mask(optics: TiDyOptics) -> Tensor:
     return plain.psf_bank(defocus=[0.0]).psfs
 
 
-def _in_metres(psi: float, optics: TiDyOptics) -> str:
+def in_metres(psi: float, optics: TiDyOptics) -> str:
+    """Return the depth of a defocus in words; a dash where the camera has no lengths.
+
+    Example:
+        >>> in_metres(0.0, TiDyOptics(fidelity="draft"))
+        '0.595 m'
+    """
     if not isinstance(optics.camera, ThinLensCamera):
         return "-"
     depth = depth_at(psi, optics.camera)
     return "inf" if math.isinf(depth) else f"{depth:.3g} m"
 
 
-def _channels(optics: TiDyOptics) -> list[str]:
+def channel_names(optics: TiDyOptics) -> list[str]:
     """Return the names of the channels: a wavelength, or a colour if a channel has several."""
     seen = [
         [wavelength for wavelength, weight in zip(optics.spectrum.wavelengths, weights, strict=True) if weight]
@@ -122,11 +128,11 @@ def _channels(optics: TiDyOptics) -> list[str]:
     return [f"{own[0] * 1e9:.0f} nm" if len(own) == 1 else name for own, name in zip(seen, names, strict=True)]
 
 
-def _half_contrast(contrast: Tensor) -> str:
+def half_contrast(contrast: Tensor) -> str:
     """Return the frequency at which contrast first falls to one half, in cycles per pixel, in words.
 
     Example:
-        >>> _half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1]))
+        >>> half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1]))
         '0.250'
     """
     frequency, values = [0.0, *ring_centres(len(contrast))], [1.0, *contrast.tolist()]
