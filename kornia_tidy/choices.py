@@ -22,6 +22,7 @@ SYSTEMS = (
     "tidy-5", "tidy-1", "fresnel", "phasecam3d", "ikoma2021", "chang2019", "liu2022-pixelwise", "liu2022-spiral",
     "sitzmann2018",
 )  # fmt: skip
+LENSES = ("double-gauss-50mm", "triplet-50mm", "single-50mm", "phone-5.5mm")
 SPLITS = ("train", "validation", "test", "all")
 BESIDE = ("image", "depth", "mask")  # of a coded image
 BETWEEN = ("random", "linear", "exponential")  # two masks, the phase while a modulator switches

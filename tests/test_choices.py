@@ -13,6 +13,7 @@ from kornia_tidy.inference.tasks import MAPS
 from kornia_tidy.mask_export import placement
 from kornia_tidy.modulator import switching
 from kornia_tidy.optics.holes import HOLES
+from kornia_tidy.optics.lens import NAMED_LENSES
 from kornia_tidy.psf import psf_bank
 from kornia_tidy.raw.color import ADAPTATIONS
 from kornia_tidy.raw.demosaic import METHODS
@@ -38,6 +39,7 @@ class TestChoices(BaseTester):
             ("COLOR_SPACES", camera_state.COLOR_SPACES),
             ("HOLES", HOLES),
             ("SYSTEMS", SYSTEMS),
+            ("LENSES", NAMED_LENSES),
             ("SPLITS", data_sets.SPLITS),
             ("BESIDE", layout.BESIDE),
             ("BETWEEN", switching.BETWEEN),

@@ -124,6 +124,8 @@ def make_parser(command: type, prog: str, everything: bool = False) -> Parser:
         action = place.add_argument(*_words(setting), help=help_text, **_options(setting, given))
         if action.required:
             usage.append(" ".join([*action.option_strings[:1], _metavar(setting)]))
+        elif action.nargs == "?" and not action.option_strings:
+            usage.append(f"[{_metavar(setting)}]")
     parser.usage = " ".join(["%(prog)s", *usage, "[options]"])
     groups[""].add_argument("-h", "--help", action="help", help="show this help")
     if notes or basic:
@@ -162,7 +164,8 @@ def _options(setting: Setting, given: Given | None) -> dict[str, Any]:
     if setting.items:
         return {**options, "nargs": setting.items, "metavar": tuple((setting.unit.symbol.split() * 2)[: setting.items])}
     if setting.items is None:
-        return options
+        left_out = isinstance(setting.unit, Argument) and setting.default is not MISSING
+        return {**options, "nargs": "?"} if left_out else options
     return {**options, "nargs": "+", **({} if isinstance(setting.unit, Argument) else {"action": "extend"})}
 
 

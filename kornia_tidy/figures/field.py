@@ -166,7 +166,7 @@ def _frame(axes: Axes, measured: FieldMeasures, f: int, d: int, half: float, *, 
     psi = measured.defocus[d]
     title = f"{measured.depths[d]}\nψ {psi:+.3g} rad" if psi else f"{measured.depths[d]}\nin focus"
     axes.set_title(title, fontsize=LABEL, color=INK, pad=4)
-    length = next(step for step in (50, 20, 10, 5, 2, 1) if step <= 0.9 * half or step == 1)
+    length = next(step for step in (50, 20, 10, 5, 2, 1) if step <= 0.7 * half or step == 1)
     color = "white" if dark else INK
     axes.plot([-0.88 * half, -0.88 * half + length], [0.86 * half] * 2, color=color, linewidth=2)
     axes.text(-0.88 * half, 0.76 * half, f"{length} px", color=color, fontsize=SMALL, bbox=None if dark else PAPER)

@@ -7,9 +7,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, NoMask, PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
+from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 
 
@@ -59,6 +60,68 @@ class TestPsf(BaseTester):
         held = 100 * optics.psf_bank(defocus=psi).psfs.detach().sum((2, 3))[0]
         told = [float(row[row.index("%") - 1]) for row in rows(capsys.readouterr().out)]
         self.assert_close(torch.tensor(told), held.float(), rtol=0, atol=0.06)
+
+    @pytest.mark.takes_seconds
+    def test_feature_over_the_field_of_a_lens_numbers_are_those_of_the_bank(self, tmp_path, capsys):
+        path = tmp_path / "lens.png"
+        words = ["--lens", "single-50mm", "--field", "2", "--depths", "0.595", "--fidelity", "draft", "--window", "31"]
+        assert main(["psf", *words, "-o", str(path)]) == 0
+        fidelity = Fidelity.preset("draft").replace(window=31, stray_light="discard")
+        optics = TiDyOptics(NoMask(), lens="single-50mm", fidelity=fidelity)
+        corner = optics.lens.field / optics.camera.pixel_pitch
+        bank = optics.psf_bank(defocus=[0.0], field=[(0.0, 0.0), (0.0, corner)])
+        table = rows(capsys.readouterr().out)
+        assert [row[0] for row in table] == ["0.00"] * 3 + ["6.78"] * 3
+        for row, own, light in zip(table, bank.psfs.flatten(0, 2), bank.light.flatten(), strict=True):
+            percent = [float(word) for word, unit in pairwise(row) if unit == "%"]
+            assert percent[0] == pytest.approx(100 * float(light), abs=0.6)
+            assert percent[1] == pytest.approx(100 * float(own.sum() / light), abs=0.06)
+            assert percent[2] == pytest.approx(100 * float(own.max() / light), abs=0.006)
+        assert read_image(path).shape[2] == 1280
+
+    @pytest.mark.takes_seconds
+    def test_feature_masks_stand_in_a_named_lens_and_in_that_of_a_file(self, tmp_path, capsys):
+        lens = Lens.named("single-50mm", 17.6, 0.595)
+        lens.save(tmp_path / "lens.safetensors")
+        rest = ["--field", "1", "--depths", "0.595", "--fidelity", "draft", "-o", str(tmp_path / "a.png")]
+        options = ["--f-number", "17.6", "--focus-distance", "0.595"]
+        assert main(["psf", "tidy-5", "--lens", "single-50mm", *options, *rest]) == 0
+        named = rows(capsys.readouterr().out)
+        assert main(["psf", "tidy-5", "--lens", str(tmp_path / "lens.safetensors"), *rest]) == 0
+        assert rows(capsys.readouterr().out) == named
+        assert main(["psf", "--lens", "single-50mm", *rest]) == 0
+        assert rows(capsys.readouterr().out) != named
+
+    @pytest.mark.takes_seconds
+    def test_feature_a_named_lens_brings_its_focal_length(self, tmp_path, capsys):
+        words = ["--f-number", "11", "--focus-distance", "0.8", "--depth-range", "0.7", "0.9", "--depths", "0.8"]
+        output = ["--fidelity", "draft", "-o", str(tmp_path / "a.png")]
+        assert main(["psf", "--lens", "double-gauss-50mm", *words, *output]) == 0
+        assert "51.4973 mm f/11, focus at 0.8 m" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            ([], "there is no camera: give CAMERA, --lens, or both"),
+            (["--lens", "single-5mm"], "--lens must be one of 'double-gauss-50mm', 'triplet-50mm'"),
+            (["--lens", "single-50mm", "--focal-length", "0.04"], "has its own: leave out --focal-length"),
+            (["--lens", "a.lens", "--f-number", "8"], "the lens a.lens has its own: leave out --f-number"),
+            (["--lens", "a.lens"], "a.lens"),
+            (["tidy-5", "--field", "3", "--fidelity", "draft"], "--field is for a camera with a lens, and tidy-5 has"),
+            (["camera.safetensors", "--lens", "single-50mm"], "camera.safetensors has a lens of its own"),
+            (["--lens", "single-50mm", "--field", "0"], "--field must be a whole number of at least 1, got 0"),
+            (["--lens", "single-50mm", "--fidelity", "paper"], "fidelity 'paper' means an ideal lens"),
+        ],
+    )
+    def test_exception_one_sentence_of_a_lens(self, words, sentence, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "a.lens").write_bytes(b"no lens")
+        save_file(TiDyOptics(fidelity="draft").state_dict(), tmp_path / "camera.safetensors")
+        assert main(["psf", *words]) == 2
+        error = capsys.readouterr().err
+        assert sentence in error
+        assert error.count("\n") == 1
+        assert not (tmp_path / "psf.png").exists()
 
     @pytest.mark.parametrize(
         ("words", "sentence"),

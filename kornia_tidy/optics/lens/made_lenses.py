@@ -45,6 +45,17 @@ def named_parts(
     return traced_parts(entry["prescription"], f_number, focus_distance, wavelengths, height, None)
 
 
+def named_focal_length(name: str) -> float:
+    """Return the focal length of a named lens in metres, without tracing its wavefronts.
+
+    Example:
+        >>> round(named_focal_length("double-gauss-50mm"), 4)
+        0.0515
+    """
+    check_choice("name of a lens", name, tuple(NAMED_LENSES))
+    return first_order(Prescription.read(NAMED_LENSES[name]["prescription"]), 8.0, math.inf).focal_length
+
+
 @on_cpu
 def traced_parts(
     prescription: Mapping[str, Any] | Prescription,
