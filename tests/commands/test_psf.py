@@ -67,7 +67,7 @@ class TestPsf(BaseTester):
         words = ["--lens", "single-50mm", "--field", "2", "--depths", "0.595", "--fidelity", "draft", "--window", "31"]
         assert main(["psf", *words, "-o", str(path)]) == 0
         fidelity = Fidelity.preset("draft").replace(window=31, stray_light="discard")
-        optics = TiDyOptics(NoMask(), lens="single-50mm", fidelity=fidelity)
+        optics = TiDyOptics(NoMask(23), lens="single-50mm", fidelity=fidelity)
         corner = optics.lens.field / optics.camera.pixel_pitch
         bank = optics.psf_bank(defocus=[0.0], field=[(0.0, 0.0), (0.0, corner)])
         table = rows(capsys.readouterr().out)
