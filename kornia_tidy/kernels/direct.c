@@ -6,7 +6,7 @@
 // registers: one vector of light is loaded once and multiplied by a different PSF sample for each row of the strip. The
 // last blocks of a row and of a plane are shifted back inside and overlap with their neighbours.
 //
-// Layers are given as in tile_plan.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one. PSFs
+// Layers are given as in scene.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one. PSFs
 // are flipped by 180 degrees, so output pixel (y, x) reads plane pixels (y, x) to (y + side - 1, x + side - 1).
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.

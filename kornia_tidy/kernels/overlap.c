@@ -9,7 +9,7 @@
 // LANES columns are transformed side by side, one in each lane, then LANES rows, all in the processor's cache. Forward
 // transforms decimate in frequency and backward ones in time, so that frequencies stay in the order they fall out in.
 //
-// Layers are given as in tile_plan.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one.
+// Layers are given as in scene.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one.
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 

@@ -56,9 +56,8 @@ def render(
             :mod:`kornia_tidy.render.borders`.
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes one by a rule, see :func:`kornia_tidy.render.dispatch.choose`;
-            ``"compiled"`` (in C), ``"tiled"`` (tiles in torch), ``"dense"`` (the definition) and ``"batched"`` (all
-            layers at once, for accelerators) ask for one. ``torch.func`` and forward-mode derivatives are for dense
-            alone.
+            ``"compiled"`` (in C), ``"batched"`` (in torch, on any device) and ``"dense"`` (the definition) ask for
+            one. ``torch.func`` and forward-mode derivatives are for dense alone.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -12,26 +11,25 @@ from kornia_tidy.render.backend import Backend, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
 from kornia_tidy.render.backends.dense import DenseBackend
-from kornia_tidy.render.backends.tiled import TiledBackend
 from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.runtime.mode import Mode, torch_mode
 
 BACKENDS: dict[str, Backend] = {
-    backend.name: backend for backend in (DenseBackend(), CompiledBackend(), TiledBackend(), BatchedBackend())
+    backend.name: backend for backend in (DenseBackend(), CompiledBackend(), BatchedBackend())
 }
-RENAMED = {"direct": "compiled", "overlap": "compiled", "triton": "batched"}  # what method= took before
+# What method= took before.
+RENAMED = {"direct": "compiled", "overlap": "compiled", "tiled": "batched", "triton": "batched"}
 # Where dense is the faster one: occlusion in C takes P^2 operations a pixel, and tiles of a small image through large
 # PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
 LARGEST_OCCLUSION, LARGEST_SHARE, LARGEST_PLANE = 65, 1 / 4, 32 << 20
-MOST_SAMPLES = 1 << 28  # of all layers: beyond, transforms take longer than launches, and tiles skip absent layers
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that renders a scene.
 
-    Transforms of torch are for dense alone. Accelerators take batched, and tiles where the planes of all layers would
-    be too large. Processors take compiled, and tiles without a compiler; large PSFs go densely where that is faster,
-    while the planes are small and no gradients are wanted, for which dense keeps every spectrum.
+    Transforms of torch are for dense alone. Accelerators take batched. Processors take compiled, and batched without a
+    compiler; large PSFs go densely where that is faster, while the planes are small and no gradients are wanted, for
+    which dense keeps every spectrum.
 
     Args:
         scene: to be rendered.
@@ -45,13 +43,12 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     if Mode.TRANSFORM in torch_mode():
         return BACKENDS["dense"]
     if scene.image.device.type != "cpu":
-        samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
-        return BACKENDS["batched" if samples <= MOST_SAMPLES else "tiled"]
+        return BACKENDS["batched"]
     side = scene.psfs.shape[-1]
     if BACKENDS["compiled"].refusal(scene) is None:
         name, large = "compiled", scene.compositing == "occlusion" and side > LARGEST_OCCLUSION
     else:
-        name, large = "tiled", side >= LARGEST_SHARE * min(scene.output_size)
+        name, large = "batched", side >= LARGEST_SHARE * min(scene.output_size)
     return BACKENDS["dense" if large and _keeps_little(scene) else name]
 
 

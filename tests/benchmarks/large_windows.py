@@ -26,7 +26,7 @@ from tests.render.scenes import Bank
 
 LAYERS, ROUNDS = 8, 3
 WINDOWS = (65, 129, 257, 513)
-METHODS = ("compiled", "tiled", "dense")
+METHODS = ("compiled", "batched", "dense")
 
 
 def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:

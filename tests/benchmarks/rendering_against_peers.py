@@ -97,7 +97,7 @@ def tiled(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
 
 def by_transforms(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     """Ours as it is without a C compiler."""
-    return render(image, psi, bank, layers="nearest", method="tiled")
+    return render(image, psi, bank, layers="nearest", method="batched")
 
 
 def dense(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
@@ -110,7 +110,7 @@ def tiled_occlusion(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
 
 def occlusion_by_transforms(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:
     """Ours as it is without a C compiler."""
-    return render(image, psi, bank, "occlusion", layers="nearest", method="tiled")
+    return render(image, psi, bank, "occlusion", layers="nearest", method="batched")
 
 
 def ikoma_stack(image: Tensor, psi: Tensor, bank: Bank) -> Tensor:

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
 from kornia_tidy.render.backend import Backend
-from kornia_tidy.render.backends.tile_plan import BLOCKS, WINDOWS
-from kornia_tidy.render.backends.tiled import TiledBackend
+from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS
 from tests.base import BaseTester
 from tests.render.scenes import Bank
 
-METHODS = ("auto", "tiled", "dense")  # those that support small scenes too
-SMALL = {"chunk_bytes": 40_000, "accelerator_bytes": 40_000}
+METHODS = ("auto", "batched", "dense")  # those that support small scenes too
 # Tiles so small, and chunks of so few of them, that a small scene has many of both.
-SMALL_TILES = TiledBackend(
-    replace(BLOCKS, sizes=(8, 12, 16), **SMALL),
-    replace(WINDOWS, sizes=(8, 12, 16), **SMALL),
-)
+SMALL_TILES = BatchedBackend(smallest=16, chunk_bytes=100_000)
 
 
 def render_by(

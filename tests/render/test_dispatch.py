@@ -38,25 +38,20 @@ class TestChoose(BaseTester):
             assert choose(scene_of(compositing, psf_size=psf_size)).name == "compiled"
 
     @over_compositing
-    def test_feature_processors_without_a_compiler_take_tiles(self, compositing, monkeypatch):
+    def test_feature_processors_without_a_compiler_take_batched(self, compositing, monkeypatch):
         monkeypatch.setattr("kornia_tidy.render.backends.compiled.compiled", lambda source, dtype: None)
         scene = scene_of(compositing)
-        assert choose(scene).name == "tiled"
+        assert choose(scene).name == "batched"
         assert explain(scene).objections == {"compiled": "it needs a C compiler (see `kornia-tidy info`)"}
         with pytest.raises(ValueError, match=r"method 'compiled' does not support this scene: it needs a C compiler"):
             choose(scene, "compiled")
 
     @over_compositing
-    def test_feature_accelerators_take_all_layers_at_once_while_they_are_few_samples(self, compositing, monkeypatch):
+    def test_feature_accelerators_take_batched(self, compositing):
         with SimulatedDevice() as device:
             bank = make_bank(6, 1, 9, dtype=torch.float32)
             tensors = (*make_scene(bank, 2, 40, 60), bank.defocus, bank.psfs)
-            scene = layered_scene(*map(device.put, tensors), compositing=compositing)
-            assert choose(scene).name == "batched"
-            monkeypatch.setattr(dispatch, "MOST_SAMPLES", 2 * 6 * 48 * 68)
-            assert choose(scene).name == "batched"
-            monkeypatch.setattr(dispatch, "MOST_SAMPLES", 2 * 6 * 48 * 68 - 1)
-            assert choose(scene).name == "tiled"
+            assert choose(layered_scene(*map(device.put, tensors), compositing=compositing)).name == "batched"
 
     @pytest.mark.parametrize("compiler", [pytest.param(True, marks=needs_compiler), False])
     def test_feature_large_psfs_go_densely_where_that_is_faster_and_memory_small(self, compiler, monkeypatch):
@@ -65,7 +60,7 @@ class TestChoose(BaseTester):
         scene = scene_of("occlusion", 3, 67, 70, 80)
         assert choose(scene).name == "dense"
         assert choose(scene_of("gather", 3, 67, 70, 80)).name == ("compiled" if compiler else "dense")
-        assert choose(scene_of("gather", 3, 17, 70, 80)).name == ("compiled" if compiler else "tiled")
+        assert choose(scene_of("gather", 3, 17, 70, 80)).name == ("compiled" if compiler else "batched")
         recorded = replace(scene, psfs=scene.psfs.clone().requires_grad_())
         assert choose(recorded).name != "dense"
         with torch.no_grad():
@@ -87,11 +82,11 @@ class TestChoose(BaseTester):
 
     def test_exception_unknown_method(self):
         bank = make_bank()
-        message = "method must be one of 'auto', 'dense', 'compiled', 'tiled', 'batched', got 'sparse'"
+        message = "method must be one of 'auto', 'dense', 'compiled', 'batched', got 'sparse'"
         with pytest.raises(ValueError, match=message):
             render(*make_scene(bank), bank, method="sparse")
 
-    @pytest.mark.parametrize(("old", "new"), [("direct", "compiled"), ("overlap", "compiled"), ("triton", "batched")])
+    @pytest.mark.parametrize(("old", "new"), dispatch.RENAMED.items())
     def test_exception_a_method_of_before_names_the_one_that_took_its_place(self, old, new):
         bank = make_bank()
         with pytest.raises(ValueError, match=f"^method '{old}' is now '{new}', or 'auto' .*"):

@@ -1,25 +1,21 @@
-"""Occlusion against models that share no code with it, its physics, and the tiled renderer against the dense one."""
+"""Occlusion against models that share no code with it, its physics, and the batched renderer against the dense one."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, cumulative_weight, lay_over
-from kornia_tidy.render.backends.tile_plan import WINDOWS, tile_grid
-from kornia_tidy.render.backends.tiled import TiledBackend
-from kornia_tidy.render.backends.window_plan import plan_windows
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import gather, occlusion, render
 from kornia_tidy.render.layers import layer_weights
-from kornia_tidy.render.scene import Labels
 from tests.base import BaseTester
-from tests.render.backends.test_tiled import KINDS, LargestTensor, depth_map
+from tests.render.backends.test_batched import KINDS, LargestTensor, depth_map
 from tests.render.render_tester import METHODS, SMALL_TILES, RenderTester, render_by
 from tests.render.scenes import Bank, brute_render, make_bank, make_scene, modelled
 from tests.rounding import gamma
@@ -247,7 +243,7 @@ class TestOcclusion(BaseTester):
         self.assert_close(function(image, defocus), expected, rtol=0, atol=1e-12)
 
 
-class TestTiledOcclusion(RenderTester):
+class TestBatchedOcclusion(RenderTester):
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("border", BORDERS)
     def test_feature_equals_the_dense_render(self, layers, border, device, dtype):
@@ -282,7 +278,7 @@ class TestTiledOcclusion(RenderTester):
         defocus = steps(bank, height, width, draw(st.integers(1, 60)))
         layers = draw(st.sampled_from(["nearest", "linear"]))
         expected = render(image, defocus, bank, "occlusion", layers=layers, border=border, method="dense")
-        coded = render(image, defocus, bank, "occlusion", layers=layers, border=border, method="tiled")
+        coded = render(image, defocus, bank, "occlusion", layers=layers, border=border, method="batched")
         self.assert_close(coded, expected, rtol=0, atol=1e-11)
 
     @pytest.mark.parametrize("border", ["zero", "replicate"])
@@ -291,12 +287,12 @@ class TestTiledOcclusion(RenderTester):
             bank = make_bank(3, 1, size, device=device)
             image, defocus = make_scene(bank, 2, height, width)
             expected = render(image, defocus, bank, "occlusion", border=border, layers="nearest", method="dense")
-            coded = render(image, defocus, bank, "occlusion", border=border, layers="nearest", method="tiled")
+            coded = render(image, defocus, bank, "occlusion", border=border, layers="nearest", method="batched")
             self.assert_close(coded, expected, rtol=0, atol=1e-9)
 
     # Gradients
 
-    @pytest.mark.parametrize("method", [SMALL_TILES, "dense"], ids=["tiled", "dense"])
+    @pytest.mark.parametrize("method", [SMALL_TILES, "dense"], ids=["batched", "dense"])
     @pytest.mark.parametrize("border", BORDERS)
     def test_gradcheck(self, method, border, device):
         bank = make_bank(3, 2, 3, device=device, light=0.8, veil=True)
@@ -321,13 +317,13 @@ class TestTiledOcclusion(RenderTester):
         options = {"layers": layers, "border": border}
         self.assert_gradients_equal_dense(SMALL_TILES, image, defocus, bank, "occlusion", atol, **options)
 
-    @pytest.mark.parametrize("kind", ["an odd number of tiles of one layer", "depths on the nodes"])
+    @pytest.mark.parametrize("kind", ["tiles of one layer", "depths on the nodes"])
     def test_feature_gradients_of_hard_scenes_equal_those_of_the_dense_render(self, kind, device):
-        tiles = TiledBackend(windows=replace(SMALL_TILES.windows, sizes=(12,)))  # 8 x 8 pixels a tile: 3 tiles
+        tiles = SMALL_TILES  # of 12 x 12 pixels: 2 blocks, the last of them beyond the image
         bank = make_bank(4, 1, 5, device=device)
-        image, _ = make_scene(bank, 1, 8, 24)
-        odd = kind.startswith("an odd")
-        defocus = bank.defocus[1].expand(1, 1, 8, 24) if odd else steps(bank, 8, 24, 5)
+        image, _ = make_scene(bank, 1, 8, 40)
+        odd = kind.startswith("tiles")
+        defocus = bank.defocus[1].expand(1, 1, 8, 40) if odd else steps(bank, 8, 40, 5)
         gradients = []
         for method in (tiles, "dense"):
             inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs)]
@@ -356,14 +352,14 @@ class TestTiledOcclusion(RenderTester):
         bank = make_bank(2, 1, 3, device=device)
         image, defocus = make_scene(bank, 1, 6, 6)
         found = []
-        for method in ("dense", "tiled"):
+        for method in ("dense", "batched"):
             psfs = bank.psfs.clone().requires_grad_()
             coded = render(image, defocus, Bank(psfs, bank.defocus), "occlusion", method=method)
             gradient = torch.autograd.grad(coded.square().sum(), psfs, create_graph=True)[0].square().sum()
             found.append(torch.autograd.grad(gradient, psfs)[0])
         self.assert_close(found[1], found[0], rtol=1e-4, atol=1e-4 * float(found[0].abs().max()))
 
-    # Memory, numeric types and the plan
+    # Memory and numeric types
 
     def test_feature_no_tensor_is_larger_than_the_image_or_a_chunk(self, device):
         """Of all that is made on the way, forward and backward, with 20 layers in every tile."""
@@ -372,9 +368,8 @@ class TestTiledOcclusion(RenderTester):
         image = torch.rand(1, 1, 128, 128, device=device).requires_grad_()
         defocus = torch.empty(1, 1, 128, 128, device=device).uniform_(-20, 20).requires_grad_()
         largest = LargestTensor()
-        windows = replace(WINDOWS, chunk_bytes=200_000, accelerator_bytes=200_000)
         with largest:
-            render_by(TiledBackend(windows=windows), image, defocus, bank, "occlusion").sum().backward()
+            render_by(BatchedBackend(chunk_bytes=200_000), image, defocus, bank, "occlusion").sum().backward()
         assert largest.bytes < 4_000_000  # two tiles of 20 layers at least; the planes of all layers are 5 MB and more
 
     @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
@@ -385,21 +380,3 @@ class TestTiledOcclusion(RenderTester):
         expected = render(image.to(half), defocus, bank, "occlusion", method="dense")
         assert coded.dtype == half
         self.assert_close(coded, expected, rtol=torch.finfo(half).eps, atol=1e-6)
-
-    @pytest.mark.parametrize("dark", [False, True])
-    def test_feature_the_plan_holds_each_tile_once_with_the_layers_of_its_window(self, dark, device):
-        lower = torch.zeros(2, 41, 55, dtype=torch.int64, device=device)  # 37 x 51 pixels and a PSF of 5
-        lower[0, 20:, 30:], lower[1, :, :9], lower[1, 3, 40] = 2, 5, 4
-        labels, windows = Labels(lower, None), SMALL_TILES.windows
-        plan = plan_windows(labels, 6, 1, tile_grid(tuple(lower.shape), 5, windows), windows, dark=dark)
-        size, seen = plan.grid.size, []
-        for chunk in plan.chunks:
-            for place, (image, y, x) in enumerate(chunk.corners):
-                window = lower[image, y : y + size, x : x + size]
-                if place not in chunk.fillers:
-                    seen.append((image, y, x))
-                    assert plan.present[chunk.layers[place]].tolist() == window.unique().tolist()
-                    in_dark = y < 2 or x < 2 or y + size > 39 or x + size > 53
-                    assert chunk.bounded == (not dark or not in_dark)
-        tile = plan.grid.tile
-        assert sorted(seen) == [(b, y, x) for b in range(2) for y in range(0, 37, tile) for x in range(0, 51, tile)]

@@ -48,7 +48,7 @@ class TestRenderLayers(BaseTester):
             torch.library.opcheck(GRADIENTS, (*given, torch.randn(2, 2, 9, 40, dtype=torch.float64), wanted))
 
     @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("method", ["auto", "tiled", "dense"])
+    @pytest.mark.parametrize("method", ["auto", "batched", "dense"])
     @pytest.mark.parametrize("layers", ["nearest", "linear"])
     @pytest.mark.parametrize("compositing", COMPOSITING)
     def test_dynamo_a_graph_renders_as_eager_code_does(self, compositing, layers, method, dtype):

@@ -1,107 +1,151 @@
-"""The batched backend: all layers of many images are convolved in one batch of transforms, for accelerators.
+"""The batched backend: batches of transforms of torch, on any device.
 
-It makes the sums of the dense backend. A kernel of an accelerator takes some microseconds to launch, and a wait for a
-value many more, so all layers of the bank are convolved, and no value of the scene is looked at. Gradients are made by
-hand, of spectra that are computed again.
+On a processor each block of two tiles is convolved with the PSFs of the layers that it contains and with no other. A
+kernel of an accelerator takes some microseconds to launch, and a wait for a value many more: there all layers are
+convolved, of whole planes or of tiles as large as memory allows, and no value of the scene is looked at.
 """
 
 from __future__ import annotations
 
-import torch
+import math
+from dataclasses import dataclass
+from itertools import count
+
 from torch import Tensor
 
-from kornia_tidy.render.backend import GradientPairs, Work
-from kornia_tidy.render.backends.batched_occlusion import occlude_batched, occlusion_gradients
+from kornia_tidy.kernels.window_sides import needed_side, next_fast_size
+from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
+from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.dense import dense_work
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
-from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
-from kornia_tidy.render.layers import weight_of_layer
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.backends.layer_sums import LayerSums, blend_gradients, seen
+from kornia_tidy.render.backends.tile_occlusion import occlude_tiles, tile_gradients
+from kornia_tidy.render.backends.tile_sums import TileSums
+from kornia_tidy.render.backends.tiles import Grid, Plan, plan_pairs
+from kornia_tidy.render.backends.whole_occlusion import occlude_whole, whole_gradients
+from kornia_tidy.render.backends.whole_sums import WholeSums
+from kornia_tidy.render.scene import SAMPLE, LayeredScene
+from kornia_tidy.runtime.precision import widest
 
-PART_BYTES = 672 << 20  # that the planes of all layers of the images worked on together may take
+MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
+PART_BYTES = 672 << 20  # that the planes of a chunk may take on an accelerator
+_STEP = 16  # samples of which windows on processors are a multiple: transforms of others take up to twice as long
+_PRODUCT = 6  # operations of a complex product
+# Planes of a pair at a time, for occlusion in each channel: spectra, products, light and quotients.
+_PLANES, _OCCLUSION_PLANES = 3, 6
 
 
+@dataclass(frozen=True)
 class BatchedBackend:
-    """Convolution of all layers in one batch. See :class:`kornia_tidy.render.backend.Backend`."""
+    """Convolution of tiles in batches of transforms. See :class:`kornia_tidy.render.backend.Backend`.
+
+    Args:
+        smallest: side of the smallest windows on a processor: calls of smaller ones take longer than their transforms.
+        chunk_bytes: that the planes of a chunk may take on a processor, near its cache (see allocator.py).
+    """
+
+    smallest: int = 64
+    chunk_bytes: int = 15 << 20
 
     name = "batched"
 
     def refusal(self, scene: LayeredScene) -> None:
         """Return None: it supports every scene."""
 
-    def work(self, scene: LayeredScene) -> Work:
-        """Return the work for all layers of the bank."""
-        return dense_work(scene, len(scene.psfs), at_once=len(scene.psfs))
-
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64 where the device has it."""
         if scene.compositing == "occlusion":
-            return occlude_batched(occlusion_planes(scene), PART_BYTES)
-        sums = _Sums(scene)
+            planes = occlusion_planes(scene)
+            return occlude_whole(planes, PART_BYTES) if _is_whole(scene) else occlude_tiles(planes, self.plan(scene))
+        sums = self._sums(scene)
         if scene.compositing == "gather":
             return sums.gather(scene.plane)
         return seen(scene, sums.scatter(scene.plane))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the planes, of the PSFs and of the layers' weights."""
-        if scene.compositing == "occlusion":
-            return occlusion_gradients(occlusion_planes(scene), gradient, PART_BYTES)
-        return blend_gradients(scene, _Sums(scene), gradient)
+        if scene.compositing != "occlusion":
+            return blend_gradients(scene, self._sums(scene), gradient)
+        planes = occlusion_planes(scene)
+        if _is_whole(scene):
+            return whole_gradients(planes, gradient, PART_BYTES)
+        return tile_gradients(planes, self.plan(scene), gradient)
+
+    def _sums(self, scene: LayeredScene) -> LayerSums:
+        if _is_whole(scene):
+            return WholeSums(scene, PART_BYTES)
+        return TileSums(scene, self.plan(scene), self.together(scene, self.grid(scene)))
+
+    def work(self, scene: LayeredScene) -> Work:
+        """Return the work, on a processor with the layers in every eighth row and column of the tiles."""
+        every = len(scene.psfs)
+        if _is_whole(scene):
+            return dense_work(scene, every, at_once=every)
+        labels, channels, grid = scene.labels, scene.image.shape[1], self.grid(scene)
+        pairs, layers, most = grid.blocks * every, every, every
+        if scene.image.device.type == "cpu":
+            held = grid.present(labels.every(SAMPLE), every, SAMPLE)
+            pairs, layers, most = (int(number) for number in (held.sum(), held.any(0).sum(), held.sum(1).max()))
+        image = channels * labels.layer_index.numel() * scene.image.element_size()
+        samples, transform = math.prod(grid.size), 2 * transform_operations(*grid.size)  # of complex planes
+        plane, chunk = channels * self._plane_bytes(scene, grid), self._chunk_bytes(scene)
+        if scene.compositing == "occlusion":  # in float64, where operations take twice as long
+            operations = 2 * ((4 * channels + 2) * transform + 3 * channels * _PRODUCT * samples) * pairs
+            memory = 2 * layers * plane + max(chunk, _OCCLUSION_PLANES * plane * most)
+            return Work(operations, memory + 2 * image + 32 * labels.layer_index.numel(), max(grid.size))
+        operations = transform * (grid.blocks + pairs + layers) + _PRODUCT * samples * pairs
+        operations *= channels * scene.image.element_size() // 4
+        memory = 2 * layers * plane + max(chunk, _PLANES * plane * most // channels)
+        return Work(operations, memory + 4 * image + 16 * labels.layer_index.numel(), max(grid.size))
+
+    def grid(self, scene: LayeredScene) -> Grid:
+        """Return the tiles of a scene: in windows of some 2.5 P pixels, or as few as an accelerator's memory allows.
+
+        Larger tiles waste less on their overlap, smaller ones hold fewer layers.
+        """
+        occludes, side, batch = scene.compositing == "occlusion", scene.psfs.shape[-1], len(scene.image)
+        height, width = scene.padded_size if scene.compositing == "scatter" else scene.output_size
+        half = -(-width // 2)
+        if scene.image.device.type == "cpu":
+            sizes = count(max(self.smallest, -(-5 * side // (2 * _STEP)) * _STEP), _STEP)
+            size = next(size for size in sizes if next_fast_size(size) == size)
+            sides = needed_side(size, height, side, _STEP), needed_side(size, half, side, _STEP)
+            return Grid(batch, (height, width), side - 1, sides, 2, occludes)
+        tile = height
+        while True:
+            sides = next_fast_size(tile + side - 1), next_fast_size(half + side - 1)
+            grid = Grid(batch, (height, width), side - 1, sides, 2, occludes)
+            if tile <= side or self._pairs(scene, grid) >= len(scene.psfs):
+                return grid
+            tile = -(-tile // 2)
+
+    def plan(self, scene: LayeredScene) -> Plan:
+        """Return the pairs of blocks and layers of a scene, in chunks."""
+        keep_memory()
+        grid = self.grid(scene)
+        return plan_pairs(grid, scene.labels, len(scene.psfs), self._pairs(scene, grid) // self.together(scene, grid))
+
+    def together(self, scene: LayeredScene, grid: Grid) -> int:
+        """Return the channels that gather and scatter work on together: one, or all where memory allows."""
+        every, channels = scene.psfs.shape[:2]
+        if scene.compositing == "occlusion" or scene.image.device.type == "cpu":
+            return 1
+        return channels if every * channels <= self._pairs(scene, grid) else 1
+
+    def _pairs(self, scene: LayeredScene, grid: Grid) -> int:
+        """Return how many pairs fit into a chunk: in one channel, or for occlusion in all of them."""
+        planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
+        return self._chunk_bytes(scene) // (planes * self._plane_bytes(scene, grid))
+
+    def _chunk_bytes(self, scene: LayeredScene) -> int:
+        return self.chunk_bytes if scene.image.device.type == "cpu" else PART_BYTES
+
+    def _plane_bytes(self, scene: LayeredScene, grid: Grid) -> int:
+        dtype = widest(scene.image.device) if scene.compositing == "occlusion" else scene.image.dtype
+        return math.prod(grid.size) * dtype.to_complex().itemsize
 
 
-class _Sums:
-    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`."""
-
-    def __init__(self, scene: LayeredScene) -> None:
-        self.psfs, self.side, self.scatters = scene.psfs.detach(), scene.psfs.shape[-1], scene.compositing == "scatter"
-        self.index, weight = scene.sorted_layers
-        self.weight = None if weight is None else weight.detach()
-
-    def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
-        size, found = (plane.shape[-2], plane.shape[-1]), []
-        psfs = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
-        for part in self._parts(plane, size):
-            blurred = from_spectrum(to_spectrum(plane[part], size)[:, None] * psfs, size, self.side)
-            index, weight = self._labels(part)
-            places = index[:, None, None].expand(len(blurred), 1, plane.shape[1], -1, -1)
-            below = blurred.gather(1, places)[:, 0]
-            if weight is not None and len(psfs) > 1:
-                above = blurred.gather(1, (places + 1).clamp_(max=len(psfs) - 1))[:, 0]
-                below = above - below if weight_gradient else torch.lerp(below, above, weight[:, None])
-            found.append(below)
-        return found[0] if len(found) == 1 else torch.cat(found)
-
-    def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        rim, found = 0 if self.scatters else self.side - 1, []  # of a capture it would be cut
-        size = pixels.shape[-2] + rim, pixels.shape[-1] + rim
-        psfs = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
-        for part in self._parts(pixels, size):
-            spectra = to_spectrum(self._own(pixels, part), size) * psfs
-            found.append(from_spectrum(spectra.sum(1), size, 1))
-        return found[0] if len(found) == 1 else torch.cat(found)
-
-    def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        size, found = (plane.shape[-2], plane.shape[-1]), []
-        for part in self._parts(plane, size):
-            own, light = to_spectrum(self._own(pixels, part), size), to_spectrum(plane[part], size)[:, None]
-            found.append((own.conj() * light).sum(0))
-        psfs = from_spectrum(sum(found[1:], found[0]), size, 1)[..., : self.side, : self.side]
-        return psfs if correlate else psfs.flip((-2, -1))
-
-    def _labels(self, part: slice) -> tuple[Tensor, Tensor | None]:
-        own = slice(None) if len(self.index) == 1 else part
-        return self.index[own], None if self.weight is None else self.weight[own]
-
-    def _own(self, pixels: Tensor, part: slice) -> Tensor:
-        """Return the light of each layer's own pixels, (B, D, C, h, w)."""
-        index, weight = self._labels(part)
-        layers = torch.arange(len(self.psfs), device=index.device)[:, None, None]
-        own = weight_of_layer(index[:, None], None if weight is None else weight[:, None], layers)
-        return own.to(pixels.dtype)[:, :, None] * pixels[part, None]
-
-    def _parts(self, plane: Tensor, size: tuple[int, int]) -> list[slice]:
-        """Return the images that are worked on together, in as few parts as memory allows."""
-        one = plane.shape[1] * len(self.psfs) * next_fast_size(size[0]) * next_fast_size(size[1]) * plane.element_size()
-        together = max(1, PART_BYTES // one)
-        return [slice(first, first + together) for first in range(0, len(plane), together)]
+def _is_whole(scene: LayeredScene) -> bool:
+    """Return whether whole planes are worked on: on an accelerator, while they are not too large for it."""
+    samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
+    return scene.image.device.type != "cpu" and samples <= MOST_SAMPLES

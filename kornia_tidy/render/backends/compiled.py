@@ -4,7 +4,7 @@ Small PSFs are convolved sample by sample (``direct.c``), larger ones by transfo
 (``overlap.c``), each block or window with the PSFs of its own layers and with no other. Occlusion is convolved directly
 (``occlusion.c``): all that is added up is positive, so float32 is enough, as the relative error of every sum is small,
 however small the normaliser that it becomes. Gradients of its PSFs and stray light are made in the same way, those of
-image and depth by tiles. See :mod:`kornia_tidy.kernels.build`.
+image and depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kernels.build`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct
 from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient, scatter_overlap, window_size
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
+from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
-from kornia_tidy.render.backends.tile_plan import WINDOWS, Grid, tile_grid
-from kornia_tidy.render.backends.tiled_occlusion import occlusion_gradients
+from kornia_tidy.render.backends.tiles import Grid
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 # With this limit and windows of 2.5 P (`window_size`) gather and scatter took 1.04 times the time of the best choice
@@ -94,7 +94,8 @@ class CompiledBackend:
             blended = 1 if labels.layer_weight is None else 2
             return Work(2 * blended * words * pixels * side**2, 2 * image + kept)
         size = window_size(side)
-        grid = Grid.of(tuple(labels.layer_index.shape), side, size)
+        _, height, width = labels.layer_index.shape
+        grid = Grid(batch, (height, width), side - 1, (size, size))
         present = grid.present(labels.every(SAMPLE), len(scene.psfs), SAMPLE)
         pairs, layers = int(present.sum()), int(present.any(0).sum())
         operations = transform_operations(size, size) * (grid.blocks + pairs + layers)
@@ -127,12 +128,10 @@ class _Sums:
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-    """Return the gradients of PSFs and stray light directly; with those of image or depth all of them by tiles."""
-    planes = occlusion_planes(scene)
-    light, psfs, weight, mean, stray_light, index, inside = planes
+    """Return the gradients of PSFs and stray light directly; with those of image or depth all by transforms."""
+    light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
     if any(wants_gradient(x) for x in (light, weight, mean)):
-        grid = tile_grid(tuple(scene.labels.layer_index.shape), psfs.shape[-1], WINDOWS)
-        return occlusion_gradients(planes, scene.labels, grid, WINDOWS, gradient)
+        return BatchedBackend().gradients(scene, gradient)
     with torch.no_grad():
         found = occlusion_direct_gradients(light, psfs, index, weight, mean, stray_light, inside, gradient)
     pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])

@@ -21,7 +21,7 @@ from kornia_tidy.render.compositing import COMPOSITING, occlusion, render
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
-from tests.render.backends.test_tiled import ATOL, depth_map
+from tests.render.backends.test_batched import ATOL, depth_map
 from tests.render.render_tester import RenderTester
 from tests.render.scenes import Bank, make_bank, make_scene
 
@@ -274,7 +274,7 @@ class TestRefusal(BaseTester):
         )
         environment = {**os.environ, "CC": "false", "XDG_CACHE_HOME": str(tmp_path)}
         run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        assert run.stdout.count("tiled it needs a C compiler") == 3
+        assert run.stdout.count("batched it needs a C compiler") == 3
 
 
 class TestWindowSize(BaseTester):

@@ -1,4 +1,4 @@
-r"""Occlusion with all layers in one batch of transforms, for accelerators.
+r"""Occlusion of whole planes: all layers in one batch of transforms, for accelerators.
 
 The planes of :mod:`kornia_tidy.render.backends.dense_occlusion`, laid over one another by a product over the layers
 instead of one after the other:
@@ -37,7 +37,7 @@ class _Layers(NamedTuple):
     alphas: Tensor
 
 
-def occlude_batched(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
+def occlude_whole(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
     """Render with occlusion; the definition is :func:`~.dense_occlusion.occlude_dense`.
 
     Args:
@@ -59,13 +59,13 @@ def occlude_batched(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
     return coded
 
 
-def occlusion_gradients(planes: OcclusionPlanes, gradient: Tensor, part_bytes: int) -> GradientPairs:
+def whole_gradients(planes: OcclusionPlanes, gradient: Tensor, part_bytes: int) -> GradientPairs:
     """Return the gradients of light rendered with occlusion: of the PSFs, and of the layers' light and alpha.
 
     Args:
         planes: of the scene.
         gradient: (B, C, H, W) of the rendered light.
-        part_bytes: as for :func:`occlude_batched`.
+        part_bytes: as for :func:`occlude_whole`.
     """
     size, side = (planes.light.shape[-2], planes.light.shape[-1]), planes.psfs.shape[-1]
     of_psfs = torch.zeros_like(planes.psfs) if wants_gradient(planes.psfs) else None
