@@ -229,5 +229,5 @@ def windows(part: Tensor, grid: Grid) -> Tensor:
         torch.Size([1, 2, 3, 2])
     """
     (height, width), (down, across) = grid.size, grid.tile
-    tiles = part.unfold(-2, height, down).unfold(-2, width, across).unflatten(-3, (-1, grid.across)).movedim(-3, -1)
-    return tiles.movedim((-5, -4), (1, 2)).flatten(0, 2).contiguous()
+    tiles = part.unfold(-2, height, down).unfold(-2, width, across).unflatten(-3, (-1, grid.across))
+    return torch.stack(tiles.movedim((-5, -4), (1, 2)).unbind(-3), -1).flatten(0, 2)
