@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.planning.costs import rendering_work
-from kornia_tidy.planning.planner import Planner
+from kornia_tidy.planning.planner import PlannedScene, Planner
 from kornia_tidy.planning.render_plan import RenderPlan
 from kornia_tidy.planning.wide_plan import plan_rays
 from kornia_tidy.psf.psf_cache import nodes_around
+
+OF_FIELD = 0.3  # of the tolerance, for PSFs between places of the field
+# Root mean square error over that of the light, for a field_tolerance of one; measured .0014 to .0086, with gather,
+# scatter and occlusion, noise and leaves, at the corner of a single element and of a double Gauss.
+FIELD_ERROR = 0.013
+LEAST_TOLERANCE, MOST_TOLERANCE = 1e-3, 0.3  # of the field
 
 
 def plan_scene(
@@ -31,11 +38,34 @@ def plan_scene(
         return _measured(optics, defocus, images, tolerance)
     planner = Planner(optics, images[1])
     scene = planner.scene(defocus, light)
+    if optics.lens is not None:
+        return _through_lens(optics, scene, (defocus.shape[-2], defocus.shape[-1]), tolerance)
     if (blur := planner.wide_blur) is None:
         return scene.plan(tolerance)
     rays = plan_rays(optics, blur, scene, defocus, tolerance)
     exact = rays.predicted_error > tolerance and planner.allows(scene.reference, *defocus.shape[-2:])
     return scene.plan(tolerance) if exact else rays
+
+
+def _through_lens(optics: Any, scene: PlannedScene, size: tuple[int, int], tolerance: float) -> RenderPlan:
+    """Return the plan behind a real lens: that of the axis within a part of the tolerance, and places over the field.
+
+    Operations and memory are those of the axis.
+    """
+    between = OF_FIELD * tolerance / max(FIELD_ERROR * scene.level, 1e-9)
+    between = min(max(between, LEAST_TOLERANCE), MOST_TOLERANCE)
+    error = FIELD_ERROR * scene.level * between
+    plan = scene.plan(tolerance - error if error < tolerance else tolerance)
+    fidelity = plan.fidelity.replace(name=f"planned, tolerance {tolerance:g}", field_tolerance=between)
+    field = optics.psf_model.with_fidelity(fidelity).field_of(size, optics.field_center)
+    return replace(
+        plan,
+        fidelity=fidelity,
+        tolerance=tolerance,
+        predicted_error=plan.predicted_error + error,
+        error_parts=(*plan.error_parts, ("PSFs between places of the field", error)),
+        field=field.nodes,
+    )
 
 
 def _measured(optics: Any, defocus: Tensor, images: tuple[int, int], tolerance: float) -> RenderPlan:

@@ -25,6 +25,8 @@ class RenderPlan:
         window: side of the largest PSF in pixels.
         wavelengths: computed for each layer, and those of the camera's spectrum, all of which the reference uses.
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
+        field: places along the picture's height and width at which PSFs are computed. Operations and memory are those
+            of one.
     """
 
     fidelity: Fidelity
@@ -39,6 +41,7 @@ class RenderPlan:
     window: int
     wavelengths: tuple[int, int]
     states: int = 1
+    field: tuple[int, int] = (1, 1)
 
     def __str__(self) -> str:
         """Describe in words what is computed, what is approximated, and the cost."""
@@ -48,13 +51,14 @@ class RenderPlan:
         elif self.fidelity == self.reference:
             first += ", as nothing cheaper is within the tolerance"
         states = f", an image for each of {self.states} states of the exposure" if self.states > 1 else ""
+        places = "" if self.field == (1, 1) else f", at {self.field[0]}x{self.field[1]} places over the picture"
         parts = [f"{name} (error {error:.1e})" for name, error in self.error_parts if error > 0]
         return "\n".join(
             [
                 first,
                 f"  computes: {self.layers[0]} of {self.layers[1]} {self.fidelity.layers} layers of defocus, PSFs of "
                 f"{self.window}x{self.window} px at {self.wavelengths[0]} of {self.wavelengths[1]} wavelengths, in "
-                f"float{64 if self.fidelity.double else 32}{states}",
+                f"float{64 if self.fidelity.double else 32}{states}{places}",
                 f"  approximates: {', '.join(parts) or 'nothing'}",
                 f"  costs: {self.operations:.2g} operations, {self.operations / self.reference_operations:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",

@@ -120,9 +120,12 @@ def turned_lenses(
         field: places (y, x) on the sensor in metres from the axis.
         defocus: radians at 530 nm, (D,).
         wavelength: in metres.
+
+    Convention:
+        - Nothing is told of what lies beyond the lens's table: PSFs are interpolated from some that do.
     """
     psi = torch.tensor(defocus, dtype=torch.float64)
-    sample = lens.sample(torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64), psi, wavelength)
+    sample = lens.table.at(torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64), psi, wavelength)
     return [TurnedLens(sample, index, math.atan2(*point), psi, wavelength) for index, point in enumerate(field)]
 
 

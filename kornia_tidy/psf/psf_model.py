@@ -245,6 +245,7 @@ class PSFModel:
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
             nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+            self._warn_if_beyond(points, nodes)
             found = self._lens_psfs(spectrum.flat(), *self.states(dtype), nodes, self.window, points, tolerance)
             return found.with_stray_light(self.fidelity.stray_light)
         if self.measured is not None:
@@ -313,6 +314,12 @@ class PSFModel:
         band = self._band() if kind == "bandlimited" else None
         return interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
 
+    def _warn_if_beyond(self, points: Sequence[tuple[float, float]], nodes: Sequence[float]) -> None:
+        lens = cast("Lens", self.lens)
+        heights = torch.tensor([math.hypot(*point) * self.camera.pixel_pitch for point in points], dtype=torch.float64)
+        for wavelength in (min(self._sampled.wavelengths), max(self._sampled.wavelengths)):
+            lens.warn_if_beyond(heights, torch.tensor(nodes, dtype=torch.float64), wavelength)
+
     def scene_field_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, field: Field) -> FieldBank:
         """Return the PSFs that a scene needs at the nodes of a field, see :meth:`scene_bank`.
 
@@ -349,6 +356,9 @@ class PSFModel:
             return None
         known = self._derived.fields
         if (size, center) not in known:
+            rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
+            corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
+            self._warn_if_beyond(corners, self.camera.defocus_range)
             reach, wavelength = self.window / 4, min(self._sampled.wavelengths)
             given = self.camera.defocus_range, wavelength, self.camera.pixel_pitch, reach
             known[size, center] = field_nodes(size, center, self.lens, *given, self.fidelity.field_tolerance)

@@ -193,3 +193,23 @@ class TestLensCaptures(BaseTester):
             ends = [capture(*(x + sign * step * way if j == i else x for j, x in enumerate(start))) for sign in (1, -1)]
             measured = (ends[0] - ends[1]) / (2 * step)
             assert abs(float((slope * way).sum() / measured) - 1) < 1e-3, i
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
+    @torch.no_grad()
+    def test_feature_plans_choose_the_places_and_keep_the_tolerance(self, compositing):
+        optics, (image, depth) = camera(compositing, center=(450.0, 520.0)), scene(48, 56)
+        reference = optics.with_fidelity(
+            SETTINGS.replace(field_tolerance=1e-3, layer_spacing=1.0, occlusion_states="each")
+        )
+        exact, before = reference(image, depth), (99, 99)
+        for tolerance in (3e-2, 3e-4):
+            plan = optics.plan(depth, image, tolerance=tolerance)
+            planned = plan.fidelity.replace(window=17, stray_light="renormalize")  # windows are compared elsewhere
+            seen = optics.with_fidelity(planned)(image, depth)
+            assert float((seen - exact).square().mean().sqrt()) <= tolerance
+            assert plan.predicted_error <= tolerance
+            assert plan.fidelity.field_tolerance < before[0]
+            before = (plan.fidelity.field_tolerance,)
+        assert plan.field != (1, 1)
+        assert "places over the picture" in str(plan)

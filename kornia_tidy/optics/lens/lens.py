@@ -301,7 +301,7 @@ class Lens(nn.Module):
 
         Beyond the table its edge stands in, with a :class:`LensRangeWarning`.
         """
-        self._warn_if_beyond(heights, defocus, wavelength)
+        self.warn_if_beyond(heights, defocus, wavelength)
         return self._table.at(heights, defocus, wavelength)
 
     @on_cpu
@@ -327,7 +327,7 @@ class Lens(nn.Module):
             heights: (F,) in metres from the axis, where light of 530 nm lands.
             defocus: of the scene in radians.
         """
-        self._warn_if_beyond(heights, torch.tensor([defocus]), None)
+        self.warn_if_beyond(heights, torch.tensor([defocus]), None)
         slopes = self._table.slopes(
             torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus])
         )[:, 0]
@@ -345,7 +345,14 @@ class Lens(nn.Module):
         sample = self.sample(heights.double(), torch.tensor([defocus]), wavelength)
         return heights * (sample.chief[:, 0] - 1)
 
-    def _warn_if_beyond(self, heights: Tensor, defocus: Tensor, wavelength: float | None) -> None:
+    def warn_if_beyond(self, heights: Tensor, defocus: Tensor, wavelength: float | None = None) -> None:
+        """Give a :class:`LensRangeWarning` if the lens is not known at a height, a defocus or a wavelength.
+
+        Args:
+            heights: (F,) in metres from the axis.
+            defocus: (D,) in radians.
+            wavelength: in metres. Default: not looked at.
+        """
         beyond = []
         if float(heights.max()) > self.field * (1 + 1e-6):
             beyond.append(f"a field of {float(heights.max()):.4g} m beyond {self.field:.4g} m")
