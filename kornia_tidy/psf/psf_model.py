@@ -49,7 +49,8 @@ from kornia_tidy.runtime.mode import Mode, torch_mode
 
 Points = tuple[tuple[float, float], ...]
 AXIS: Points = ((0.0, 0.0),)
-MOST_FIELDS = 8  # sizes of pictures whose nodes are remembered
+MOST_FIELDS = 8  # sizes and places of pictures whose nodes are remembered
+MOST_PICTURES = 3  # the same, whose PSFs are: some 70 MB each, for 65 px and 72 nodes
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
@@ -64,6 +65,10 @@ class Derived:
         self.fields: dict[tuple[tuple[int, int], tuple[float, float]], Field] = {}
         self.light: tuple[object, Tensor] | None = None  # over the field, and what for
         self.lit: tuple[PSFBank, FieldBank] | None = None  # the last PSFs, and the same with their light
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what travels with pickle and deepcopy: no PSFs."""
+        return {**vars(self), "lit": None}
 
 
 class PSFModel:
@@ -351,9 +356,17 @@ class PSFModel:
         Args:
             size: rows and columns of the picture.
             center: of the picture, y and x in sensor pixels from the lens's axis.
+
+        Raises:
+            NotImplementedError: while torch compiles or exports, which needs values.
         """
         if self.lens is None or self.measured is not None:
             return None
+        if torch.compiler.is_compiling():
+            raise NotImplementedError(
+                "a camera behind a real lens cannot be compiled or exported: call it from outside of torch.compile, or "
+                "leave lens= out"
+            )
         known = self._derived.fields
         if (size, center) not in known:
             rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
@@ -363,7 +376,7 @@ class PSFModel:
             given = self.camera.defocus_range, wavelength, self.camera.pixel_pitch, reach
             known[size, center] = field_nodes(size, center, self.lens, *given, self.fidelity.field_tolerance)
             if len(known) > MOST_FIELDS:
-                known.pop(next(iter(known)))
+                known.pop(next(iter(known)), None)
         return known[size, center]
 
     def group_bank(
@@ -423,8 +436,11 @@ class PSFModel:
         setting += plain_attributes(self.masks, self.camera)
         # Sums of another number of threads are rounded in another order.
         key = self.moment, self.state, torch.get_num_threads(), grid, points
-        if points != AXIS:  # of one picture at a time
-            memories.update({other: BankMemory() for other in memories if other[-1] not in (AXIS, points)})
+        if points != AXIS and key not in memories:
+            fields = list(dict.fromkeys(k[-1] for k in list(memories) if k[-1] != AXIS))
+            oldest = fields[: max(0, len(fields) + 1 - MOST_PICTURES)]
+            for other in [k for k in list(memories) if k[-1] in oldest]:
+                memories.pop(other, None)
         memory = memories.get(key) or memories.setdefault(key, BankMemory())
         return memory.recall(spectrum, setting, states, compared, nodes, build, stray_light)
 

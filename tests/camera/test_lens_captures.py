@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -213,3 +214,29 @@ class TestLensCaptures(BaseTester):
             before = (plan.fidelity.field_tolerance,)
         assert plan.field != (1, 1)
         assert "places over the picture" in str(plan)
+
+    @torch.no_grad()
+    def test_feature_pictures_of_other_sizes_are_remembered_and_do_not_travel(self):
+        optics = camera(center=(450.0, 520.0))
+        sizes = [(24, 24), (24, 30), (30, 24), (24, 24)]
+        captures = [optics(*scene(*size)) for size in sizes]
+        assert torch.equal(captures[0], captures[-1])
+        fields = {key[-1] for key in optics.psf_model._memories} - {((0.0, 0.0),)}
+        assert len(fields) == 3
+        optics(*scene(40, 24))
+        kept = {key[-1] for key in optics.psf_model._memories} - {((0.0, 0.0),)}
+        assert len(kept) == 3
+        assert len(pickle.dumps(optics)) < len(pickle.dumps(camera())) + 20_000
+
+    @torch.no_grad()
+    def test_feature_states_restore_captures_to_the_last_bit(self):
+        optics, (image, depth) = camera(), scene(24, 24)
+        other = camera()
+        other.masks.phase.data.zero_()
+        other.load_state_dict(optics.state_dict())
+        assert torch.equal(other(image, depth), optics(image, depth))
+
+    def test_exception_compiling(self):
+        optics, (image, depth) = camera(), scene(24, 24)
+        with pytest.raises(Exception, match="a camera behind a real lens cannot be compiled or exported"):
+            torch.compile(optics, backend="eager", fullgraph=True)(image, depth)

@@ -82,7 +82,7 @@ class Lens(nn.Module):
         self.f_number = f_number
         self.focus_distance = focus_distance
         self._residual = residual  # no setting: it is known as well as its digits are
-        self._table = table
+        self._table = table.rounded()  # as files hold it, so that a lens from a file is the same
 
     # ------------------------------------------------------------------ where lenses come from
 

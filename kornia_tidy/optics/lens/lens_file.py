@@ -11,20 +11,19 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_positive
 from kornia_tidy.files import parse_json
-from kornia_tidy.optics.lens.lens_table import LensTable
+from kornia_tidy.optics.lens.lens_table import EXACT, LensTable
 from kornia_tidy.optics.lens.made_lenses import LensParts
 from kornia_tidy.runtime.default_device import on_cpu
 
 _FORMAT = "kornia_tidy.lens/1"
 _SCALARS = ("focal_length", "f_number", "focus_distance", "residual")
-_EXACT = ("wavelengths", "defocus", "field")
 
 
 @on_cpu
 def lens_bytes(parts: LensParts) -> bytes:
     """Return a lens as a file: coefficients in float32, lengths in float64."""
     tensors = {name: part.float().contiguous() for name, part in parts.table.tensors().items()}
-    tensors |= {name: getattr(parts.table, name) for name in _EXACT}
+    tensors |= {name: getattr(parts.table, name) for name in EXACT}
     tensors["scalars"] = torch.tensor([getattr(parts, name) for name in _SCALARS], dtype=torch.float64)
     # One entry: safetensors writes several in any order, and equal lenses are equal files.
     return save(tensors, {_FORMAT: json.dumps({"name": parts.name, "source": parts.source})})

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from kornia_tidy.optics.lens.field_table import defocus_terms, height_weights
 
+EXACT = ("wavelengths", "defocus", "field")  # in float64 in files too
+
 
 @dataclass(frozen=True, eq=False)
 class LensTable:
@@ -52,6 +54,11 @@ class LensTable:
     def tensors(self) -> dict[str, Tensor]:
         """Return all parts by their names."""
         return {part.name: getattr(self, part.name) for part in fields(self)}
+
+    def rounded(self) -> LensTable:
+        """Return the table as files hold it: in float32, but for :data:`EXACT`."""
+        parts = self.tensors().items()
+        return LensTable(**{name: part if name in EXACT else part.float().to(part.dtype) for name, part in parts})
 
     @property
     def reach(self) -> tuple[float, float]:
