@@ -13,6 +13,7 @@ from kornia_tidy.optics.materials import DISPERSIONS, Material, cauchy_through, 
 UNITS = {"m": 1.0, "mm": 1e-3}
 KINDS = ("surface", "stop")
 LONGEST = 10.0  # metres from the first surface to the last; longer ones are millimetres read as metres
+SMALLEST = 1e-5  # metres, of a clear radius: through smaller ones no rays are
 MOST_SURFACES, HIGHEST_POWER = 200, 30
 _SURFACE_KEYS = {"kind", "R", "k", "poly", "t", "glass", "r"}
 _KEYS = {"name", "source", "unit", "surfaces", "index", "image_plane_infinity"}
@@ -166,8 +167,8 @@ def _surface(i: int, row: Any, scale: float, *, last: bool) -> Surface:
     edge = math.inf
     if clear is not None:
         edge = _number(f"r of {what}", clear) * scale
-        if edge <= 0:
-            raise ValueError(f"r of {what} must be positive or None, got {clear}")
+        if not edge >= SMALLEST:
+            raise ValueError(f"r of {what} must be at least {SMALLEST:g} m or None, got {clear} ({edge:.3g} m)")
     return Surface(curvature, conic, terms, gap * scale, glass, edge, kind == "stop")
 
 

@@ -86,7 +86,7 @@ class TestPrescription(BaseTester):
             (changed(("surfaces", 0, "poly"), {4: 1, "4": 1}), ValueError, "must have each power once, got 4, 4"),
             (changed(("surfaces", 0, "glass"), "flint"), ValueError, "must have the glass 'flint', got glass"),
             (changed(("surfaces", 0, "glass"), None), TypeError, "glass of surface 0 must be a name, got None"),
-            (changed(("surfaces", 0, "r"), 0.0), ValueError, "r of surface 0 must be positive or None, got 0"),
+            (changed(("surfaces", 0, "r"), 0.0), ValueError, "r of surface 0 must be at least 1e-05 m or None, got 0"),
             (changed(("surfaces", 0, "kind"), "mirror"), ValueError, "must be one of 'surface', 'stop', got 'mirror'"),
             (changed(("surfaces", 0, "kind"), "stop"), ValueError, "is the stop and must be a plane, got R=0.04"),
             (changed(("surfaces", 2), {"t": 6e-3}), ValueError, "must have one of kind 'stop', got 0"),
