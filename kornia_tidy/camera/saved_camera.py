@@ -17,6 +17,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
 from kornia_tidy.optics.materials import DISPERSIONS, Material
+from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.psf.camera_settings import EXTRA_STATE, read_settings, settings_of, take_over
 
 KINDS: dict[str, type] = {"Fidelity": Fidelity} | {
@@ -131,6 +132,8 @@ def _made(described: Any, weights: Mapping[str, Tensor], pixels: tuple[int, ...]
             f"a {described['is']!s:.80} is no class of this package: make the camera in Python, then load the state"
         )
     given: dict[str, Any] = {**weights, **described}
+    if kind is DefocusRange:
+        given["camera"] = given.pop("lens")  # the name in states
     if kind is Material:
         given["dispersion"] = DISPERSIONS[described["dispersion"]]
     if issubclass(kind, PhaseMasks | LearnableDwellTimes):

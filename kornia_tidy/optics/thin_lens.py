@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import overload
 
 import torch
@@ -334,16 +335,17 @@ class ThinLensCamera(nn.Module):
 class DefocusRange(nn.Module):
     r"""A camera for depth maps that hold normalised disparity: maps [0, 1] linearly to a range of defocus.
 
-    The paper's data set has such maps. The lens only sets the size of the PSF on the sensor.
+    The paper's data set has such maps. The camera that it is given only sets the size of the PSF on the sensor.
 
     Args:
         lo: defocus in radians at a disparity of 0.
         hi: defocus in radians at a disparity of 1.
-        lens: aperture, image distance and pixel pitch of the PSFs. Default: :class:`ThinLensCamera`.
+        camera: aperture, image distance and pixel pitch of the PSFs. Default: :class:`ThinLensCamera`.
+        lens: the old word for ``camera``, with a warning.
 
     Raises:
-        ValueError: if ``lo`` is not below ``hi``.
-        TypeError: if ``lens`` is not a ThinLensCamera.
+        ValueError: if ``lo`` is not below ``hi``, or both words are given.
+        TypeError: if ``camera`` is not a ThinLensCamera.
 
     Convention:
         - Defocus is in radians at the pupil edge at 530 nm, positive nearer than focus, so 1 is nearest.
@@ -356,13 +358,25 @@ class DefocusRange(nn.Module):
         tensor([-20.,   0.,  20.])
     """
 
-    def __init__(self, lo: float = -20.0, hi: float = 20.0, lens: ThinLensCamera | None = None) -> None:
+    def __init__(
+        self,
+        lo: float = -20.0,
+        hi: float = 20.0,
+        camera: ThinLensCamera | None = None,
+        *,
+        lens: ThinLensCamera | None = None,
+    ) -> None:
         super().__init__()
+        if lens is not None:
+            if camera is not None:
+                raise ValueError("a DefocusRange takes camera= or its old word lens=, not both")
+            warnings.warn("DefocusRange(lens=...) is now DefocusRange(camera=...)", FutureWarning, stacklevel=2)
+            camera = lens
         if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
             raise ValueError(f"a defocus range must be finite with lo < hi, got lo={lo}, hi={hi}")
         self.defocus_range = (float(lo), float(hi))
-        self.lens = ThinLensCamera() if lens is None else lens
-        check_part("lens", self.lens, ThinLensCamera, "a ThinLensCamera")
+        self.lens = ThinLensCamera() if camera is None else camera  # the name in states
+        check_part("camera", self.lens, ThinLensCamera, "a ThinLensCamera")
 
     @property
     def aperture_radius(self) -> float:
@@ -407,7 +421,7 @@ class DefocusRange(nn.Module):
 
     def resized(self, scale: float) -> DefocusRange:
         """Return this camera for images resized by ``scale``. See :meth:`ThinLensCamera.resized`."""
-        return DefocusRange(*self.defocus_range, lens=self.lens.resized(scale))
+        return DefocusRange(*self.defocus_range, self.lens.resized(scale))
 
     def extra_repr(self) -> str:
         """Return a one-line description of the range."""

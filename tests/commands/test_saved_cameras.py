@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from kornia_tidy import (
+    DefocusRange,
     DwellTimes,
     LearnableDwellTimes,
     SensorNoise,
@@ -179,6 +180,12 @@ class OwnSensor(SensorNoise):
 
 
 class TestCameraOfState(BaseTester):
+    def test_feature_a_range_of_defocus_has_its_camera(self):
+        optics = TiDyOptics(PixelwiseMask(1), DefocusRange(-10, 10, ThinLensCamera(f_number=12)), fidelity="draft")
+        again = camera_of_state(optics.state_dict())
+        assert again.settings() == optics.settings()
+        assert again.camera.aperture_radius == optics.camera.aperture_radius
+
     @pytest.mark.parametrize(("family", "constraint", "modulator"), CROSSED)
     def test_feature_a_capture_is_the_same_to_the_last_bit(self, family, constraint, modulator, tmp_path):
         material = material_of(family, constraint, modulator)

@@ -142,7 +142,7 @@ LENSES = {
     "wide": lambda: (PixelwiseMask(1, size=(23, 31)), {}),
     "gaps": lambda: (PixelwiseMask(1), {"modulator": SpatialLightModulator(DwellTimes(), fill_factor=0.9)}),
     "mixed channels": lambda: (PixelwiseMask(1), {"spectrum": Spectrum((5e-7, 6e-7), ((1, 1), (0, 1)))}),
-    "glass": lambda: (PixelwiseMask(1), {"camera": DefocusRange(lens=ThinLensCamera(lens_material=PMMA))}),
+    "glass": lambda: (PixelwiseMask(1), {"camera": DefocusRange(camera=ThinLensCamera(lens_material=PMMA))}),
 }
 
 

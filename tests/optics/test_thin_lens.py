@@ -179,6 +179,14 @@ class TestDefocusRange(BaseTester):
         with pytest.raises(ValueError, match="lo < hi"):
             DefocusRange(3, 3)
 
+    def test_exception_the_old_word_for_its_camera_warns(self):
+        lens = ThinLensCamera(f_number=8)
+        with pytest.warns(FutureWarning, match=r"DefocusRange\(lens=...\) is now DefocusRange\(camera=...\)"):
+            old = DefocusRange(lens=lens)
+        assert old.aperture_radius == DefocusRange(camera=lens).aperture_radius
+        with pytest.raises(ValueError, match="takes camera= or its old word lens=, not both"):
+            DefocusRange(camera=lens, lens=lens)
+
     def test_feature_resized_scales_the_pixel(self):
         assert DefocusRange().resized(2.0).pixel_pitch == 4e-6
 
@@ -216,7 +224,7 @@ class TestSinglet(BaseTester):
 
     def test_feature_travels_with_the_camera(self):
         lens = ThinLensCamera.for_scene((0.5, 4.0), lens_material=PMMA)
-        assert DefocusRange(lens=lens).resized(0.5).chromatic_defocus(470e-9) == lens.chromatic_defocus(470e-9) < 0
+        assert DefocusRange(camera=lens).resized(0.5).chromatic_defocus(470e-9) == lens.chromatic_defocus(470e-9) < 0
         assert "a single element of PMMA" in repr(lens)
 
     @pytest.mark.parametrize("fidelity", ["draft", "paper"])
