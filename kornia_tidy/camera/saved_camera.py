@@ -16,6 +16,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.materials import DISPERSIONS, Material
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.psf.camera_settings import EXTRA_STATE, read_settings, settings_of, take_over
@@ -57,6 +58,8 @@ def camera_of_state(state: Mapping[str, Tensor]) -> TiDyOptics:
     parts["fidelity"] = parts["fidelity"].replace(window=window)  # so that it need not be measured
     if (amplitude := state.get("aperture.amplitude")) is not None:
         parts["aperture"] = nn.Parameter(amplitude.detach().clone().clamp(0, 1))
+    if (lens := state.get(f"lens.{EXTRA_STATE}")) is not None:
+        parts["lens"] = Lens.of_state(lens)
     paper = parts["fidelity"].propagation == "paper"
     with torch.random.fork_rng(devices=[]):
         camera = TiDyOptics(masks_of_state(state), color_space="paper" if paper else "srgb", **parts)

@@ -14,7 +14,6 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.polynomial import chebyshev
 from torch import Tensor
 
 
@@ -100,7 +99,7 @@ def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor]:
         ([[0.25, 0.75]], [[-0.5, 0.5]])
     """
     series, derived = _series(count)
-    at = torch.from_numpy(chebyshev.chebvander(places.double().cpu().numpy(), max(count - 1, 1)))
+    at = torch.from_numpy(np.polynomial.chebyshev.chebvander(places.double().cpu().numpy(), max(count - 1, 1)))
     return at[:, :count] @ series, at[:, : len(derived)] @ derived
 
 
@@ -108,5 +107,6 @@ def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor]:
 def _series(count: int) -> tuple[Tensor, Tensor]:
     """Return the Chebyshev series of the Lagrange polynomials and of their slopes, a column for each."""
     with torch.inference_mode(False):
-        series = np.linalg.inv(chebyshev.chebvander(chebyshev_points(count), count - 1))
-        return torch.from_numpy(series), torch.from_numpy(chebyshev.chebder(series, axis=0))
+        polynomials = np.polynomial.chebyshev
+        series = np.linalg.inv(polynomials.chebvander(chebyshev_points(count), count - 1))
+        return torch.from_numpy(series), torch.from_numpy(polynomials.chebder(series, axis=0))

@@ -21,6 +21,7 @@ from kornia_tidy.psf.scattered_transform import patches_of, scattered_axis, scat
 from kornia_tidy.runtime.default_device import on_cpu
 
 _LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
+_BEYOND = 1.5  # times the lens's range, by which PSFs within it may be interpolated
 _GRID = 41  # points along the stop at which the steepest phase is looked for
 
 
@@ -75,7 +76,7 @@ def lens_psfs(
         (D,): see :func:`lens_light`.
     """
     wavelength = turned.wavelength
-    steepest, complex_dtype = turned.steepest(sensor), screens[0].waves.dtype
+    steepest, complex_dtype = turned.widest.steepest(sensor), screens[0].waves.dtype
     widest = max(float((screen.spans[1] - screen.spans[0]).max()) for screen in screens)
     stops = [_stop(turned, screen.spans, steepest * widest / 2, sensor.tolerance) for screen in screens]
     points = [stop for stop, _ in stops]
@@ -125,8 +126,19 @@ def turned_lenses(
         - Nothing is told of what lies beyond the lens's table: PSFs are interpolated from some that do.
     """
     psi = torch.tensor(defocus, dtype=torch.float64)
-    sample = lens.table.at(torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64), psi, wavelength)
-    return [TurnedLens(sample, index, math.atan2(*point), psi, wavelength) for index, point in enumerate(field)]
+    heights = torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64)
+    # PSFs are as fine as the lens's whole range asks, or a multiple of it: what they are computed with is no matter.
+    times = max(1, math.ceil(float(psi.abs().max()) / (_BEYOND * max(map(abs, lens.table.reach)) or 1.0)))
+    ends = times * torch.tensor(lens.table.reach, dtype=torch.float64)
+    found = []
+    for sample, own in (
+        (lens.table.at(heights, ends, wavelength), ends),
+        (lens.table.at(heights, psi, wavelength), psi),
+    ):
+        found.append([TurnedLens(sample, i, math.atan2(*point), own, wavelength) for i, point in enumerate(field)])
+    for widest, turned in zip(*found, strict=True):
+        turned.widest = widest
+    return found[1]
 
 
 Stop = tuple[StopQuadrature, Tensor]  # points in patches, (C, S), and polynomials there, (J, C, S)
@@ -159,6 +171,7 @@ class TurnedLens:
 
     def __init__(self, sample: LensSample, index: int, azimuth: float, psi: Tensor, wavelength: float) -> None:
         self.psi, self.azimuth, self.wavelength = psi, azimuth, wavelength
+        self.widest = self  # the same at the ends of the range of defocus
         self.scale = REFERENCE_WAVELENGTH / wavelength
         self.edges = sample.edges[index]
         sines = {"tangential"}

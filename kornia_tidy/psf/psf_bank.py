@@ -82,7 +82,8 @@ class PSFBank:
         A channel sees all light of its own reflectance and none of the others'. What the window holds of each differs,
         as it does between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.
         """
-        seen = torch.eye(basis).to(self.energy)  # (C, B), as many channels as reflectances
+        seen = torch.eye(basis).to(self.energy)  # (C, B), as many channels as reflectances, at each point of a field
+        seen = seen.repeat(self.energy.shape[1] // basis**2, 1)
         energy = self.energy.unflatten(1, (-1, basis))
         if kind != "renormalize":
             return PSFBank(self.psfs, self.defocus, self.energy, (seen - energy).flatten(1) if kind == "veil" else None)

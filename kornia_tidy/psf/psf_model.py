@@ -474,10 +474,11 @@ class PSFModel:
                 )
                 for own, share in shown
             ]
-            light = torch.where(banks[0].light == 0, 1, banks[0].light)
-            psfs = [(bank.psfs / light[..., None, None]).movedim(0, 1).flatten(1, 2) for bank in banks]
-            energy = [bank.energy.movedim(0, 1).flatten(1, 2) for bank in banks]
-            return PSFBank(torch.cat(psfs, 1), states.new_tensor(nodes), torch.cat(energy, 1))
+            basis = len(spectrum.basis or (1,))  # whose planes have the light of their channel
+            light = banks[0].light.unflatten(2, (-1, basis)).sum(3).repeat_interleave(basis, 2)
+            light = torch.where(light == 0, 1, light)[..., None, None]
+            psfs = torch.cat([(bank.psfs / light).movedim(0, 1).flatten(1, 2) for bank in banks], 1)
+            return PSFBank(psfs, states.new_tensor(nodes), psfs.sum((2, 3)))
         if self.fidelity.propagation == "paper":
             if pupil.fill_factor != 1:
                 raise ValueError(

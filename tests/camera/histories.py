@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -48,14 +49,15 @@ from kornia_tidy import (
 from kornia_tidy.camera.saved_camera import camera_of_state
 from kornia_tidy.masks import MASK_SPAN, CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import DiffractionEfficiency
-from kornia_tidy.optics import annular_aperture, camera_spectrum
+from kornia_tidy.optics import Lens, annular_aperture, camera_spectrum
 from kornia_tidy.sensor.fixed_pattern import draw_pattern
 
 T = TypeVar("T")
 
 COMPOSITINGS = ("gather", "scatter", "occlusion")
 BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
-LENSES = ("default", "range", "ring", "wide", "wide ring")
+LENSES = ("default", "range", "ring", "wide", "wide ring", "real")
+CORNER = (400.0, 500.0)  # px from the axis of a real lens
 MASKS = ("pixelwise", "zernike", "radial", "spiral", "fourier", "cubic", "fresnel", "none")
 MODULATORS = ("equal", "unequal", "learnt", "switching", "efficiency")
 SPECTRA = ("rgb", "monochrome", "binned", "reflectance")
@@ -114,6 +116,7 @@ class Camera:
         return TiDyOptics(
             masks, _lens(self.lens), _modulator(self.modulator, len(masks.phase)), _sensor(self.sensor, self.seed),
             self.fidelity, self.compositing, self.color_space, self.border, _spectrum(self.spectrum), aperture,
+            lens=copy.deepcopy(_real_lens()) if self.lens == "real" else None, field_center=CORNER,
         )  # fmt: skip
 
 
@@ -134,6 +137,11 @@ def _lens(name: str) -> ThinLensCamera | DefocusRange:
     if name.startswith("wide"):  # the disc of infinity has a radius of 20 pixels
         return ThinLensCamera(50e-3, None, 2.0, 8e-6, (1.7, math.inf), f_number=4.0)
     return ThinLensCamera()
+
+
+@cache
+def _real_lens() -> Lens | None:
+    return TiDyOptics(lens="single-50mm", fidelity="draft").lens
 
 
 def _modulator(name: str, count: int) -> Any:
@@ -168,7 +176,7 @@ def _sensor(name: str, seed: int) -> SensorNoise | None:
 def draw_camera(choose: Choose) -> Camera:
     """Draw how to make a camera; what contradicts another part is left out."""
     lens, compositing = choose(LENSES), choose(COMPOSITINGS)
-    wide = lens.startswith("wide")
+    wide, hides = lens.startswith("wide"), compositing == "occlusion"
     paper = lens == "range" and compositing == "gather" and choose((False, False, False, True))
     masks = choose(("none", "none", "none", "pixelwise") if wide else MASKS)
     spectrum = choose(SPECTRA[:3] if compositing == "occlusion" or wide else SPECTRA)
@@ -180,11 +188,12 @@ def draw_camera(choose: Choose) -> Camera:
         window=25 if sampled else None if wide else choose((None, 9, 15)),
         max_window=21,
         enclosed_energy=0.05,
-        stray_light=choose(("renormalize", "renormalize", "veil", "discard")),
+        stray_light=choose(("renormalize", "renormalize", "discard", "veil")[: 3 if lens == "real" and hides else 4]),
         double=choose((False, False, True)),
         wavelengths=2 if spectrum == "binned" else None,
         occlusion_states=choose(("each", "mean")),
         wide_blur="waves" if sampled else "rays",
+        field_tolerance=5e-3,
     )
     border, sensor, seed = choose(BORDERS), choose(SENSORS), choose(range(1000))
     if paper:
@@ -522,6 +531,7 @@ def from_a_file(life: Life, noise: Callable[[], Noise]) -> Taken:
         path = Path(folder) / "camera.safetensors"
         save_file({name: value.contiguous() for name, value in life.optics.state_dict().items()}, path)
         optics = camera_of_state(load_file(path))
+    optics.field_center = life.optics.field_center
     return life.shoot(noise(), optics), EVERYWHERE, True
 
 

@@ -12,6 +12,7 @@ import torch
 from torch.nn.functional import pad
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy.camera import camera_of_state
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
 from kornia_tidy.psf import PSFBank
@@ -235,6 +236,16 @@ class TestLensCaptures(BaseTester):
         other.masks.phase.data.zero_()
         other.load_state_dict(optics.state_dict())
         assert torch.equal(other(image, depth), optics(image, depth))
+        made = camera_of_state(optics.state_dict())
+        made.sensor, made.field_center = None, optics.field_center
+        assert torch.equal(made(image, depth), optics(image, depth))
+
+    @torch.no_grad()
+    def test_feature_a_psf_does_not_depend_on_those_computed_with_it(self):
+        model = camera().psf_model
+        together = model.psf_bank(defocus=[-19.0, -3.0, 2.0, 20.0], field=[(0.0, 0.0), CORNER])
+        alone = model.psf_bank(defocus=[2.0], field=[CORNER])
+        assert torch.equal(alone.psfs[0, 0], together.psfs[1, 2])
 
     def test_exception_compiling(self):
         optics, (image, depth) = camera(), scene(24, 24)

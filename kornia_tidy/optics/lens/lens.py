@@ -404,17 +404,22 @@ class Lens(nn.Module):
         """Return the lens as the bytes of its file, uint8."""
         return torch.frombuffer(bytearray(lens_bytes(self._parts())), dtype=torch.uint8).clone()
 
+    @classmethod
+    def of_state(cls, state: Tensor) -> Self:
+        """Return the lens of :meth:`get_extra_state`, as states of cameras hold it under ``lens._extra_state``.
+
+        Raises:
+            ValueError: if it is damaged.
+        """
+        return cls(**_state_parts(state)._asdict())
+
     def set_extra_state(self, state: Tensor) -> None:
         """Take the lens of a state.
 
         Raises:
             ValueError: if it is damaged.
         """
-        what = "the lens in the state"
-        if not isinstance(state, Tensor) or state.dtype != torch.uint8:
-            raise ValueError(f"{what} must be bytes, got {described(state)}")
-        parts = lens_parts(*parse_tensors(state.cpu().numpy().tobytes(), what), what)
-        given = parts._asdict()
+        given = _state_parts(state)._asdict()
         self._table, self._residual = given.pop("table"), given.pop("residual")
         vars(self).update(given)
 
@@ -441,3 +446,10 @@ class Lens(nn.Module):
             f"m, field to {self.field * 1e3:.3g} mm, psi {low:+.1f} to {high:+.1f}, "
             f"{', '.join(f'{w * 1e9:.0f}' for w in self.wavelengths)} nm, {self.residual:.4f} waves rms off"
         )
+
+
+def _state_parts(state: Tensor) -> LensParts:
+    what = "the lens in the state"
+    if not isinstance(state, Tensor) or state.dtype != torch.uint8:
+        raise ValueError(f"{what} must be bytes, got {described(state)}")
+    return lens_parts(*parse_tensors(state.cpu().numpy().tobytes(), what), what)
