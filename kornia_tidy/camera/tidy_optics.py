@@ -30,6 +30,7 @@ from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
+from kornia_tidy.psf.field import check_center
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
 from kornia_tidy.psf.psf_model import PSFModel
@@ -178,7 +179,7 @@ class TiDyOptics(CameraState):
         self.check_inputs = check_inputs
         self.holes = holes
         self.memory_budget = memory_budget
-        self.field_center = field_center
+        self.field_center = check_center(field_center)
         self.notes = Notes()  # shared with cameras made by _replace
 
     @classmethod

@@ -11,10 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+
+from kornia_tidy.checks import described
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,24 @@ class Field:
         places = (pixels.double() - half) / max(half, 0.5)
         weights, slopes = lagrange(self.nodes[axis], places.clamp(-1, 1))
         return weights, slopes / max(half, 0.5) * (places.abs() <= 1)[:, None]
+
+
+def check_center(center: Any) -> tuple[float, float]:
+    """Return where the middle of a picture lies, y and x in sensor pixels from the lens's axis, or raise an error.
+
+    Example:
+        >>> check_center([3, 4])
+        (3.0, 4.0)
+    """
+    try:
+        y, x = (float(part) for part in center)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(
+            f"field_center must be two numbers, y and x in sensor pixels, got {described(center)}"
+        ) from None
+    if not (math.isfinite(y) and math.isfinite(x)):
+        raise ValueError(f"field_center must be finite, got {(y, x)}")
+    return y, x
 
 
 def chebyshev_points(count: int) -> list[float]:

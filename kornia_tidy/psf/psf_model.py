@@ -30,7 +30,7 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
 )
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.field import Field, check_center
 from kornia_tidy.psf.field_bank import FieldBank, check_field, field_light, field_psf_bank
 from kornia_tidy.psf.field_nodes import field_nodes
 from kornia_tidy.psf.geometric_psf import blur_radius
@@ -358,6 +358,8 @@ class PSFModel:
             center: of the picture, y and x in sensor pixels from the lens's axis.
 
         Raises:
+            TypeError: if the centre is not two numbers.
+            ValueError: if it is not finite.
             NotImplementedError: while torch compiles or exports, which needs values.
         """
         if self.lens is None or self.measured is not None:
@@ -367,7 +369,7 @@ class PSFModel:
                 "a camera behind a real lens cannot be compiled or exported: call it from outside of torch.compile, or "
                 "leave lens= out"
             )
-        known = self._derived.fields
+        known, center = self._derived.fields, check_center(center)
         if (size, center) not in known:
             rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
             corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]

@@ -247,6 +247,23 @@ class TestLensCaptures(BaseTester):
         alone = model.psf_bank(defocus=[2.0], field=[CORNER])
         assert torch.equal(alone.psfs[0, 0], together.psfs[1, 2])
 
+    @pytest.mark.parametrize(
+        ("center", "error", "message"),
+        [
+            (5.0, TypeError, "field_center must be two numbers, y and x in sensor pixels, got the number 5.0"),
+            ((1, 2, 3), TypeError, "field_center must be two numbers, .* got a tuple"),
+            (torch.zeros(4, 2), TypeError, "field_center must be two numbers"),
+            ((0.0, math.nan), ValueError, "field_center must be finite, got"),
+        ],
+    )
+    def test_exception_centers(self, center, error, message):
+        with pytest.raises(error, match=message):
+            camera(center=center)
+        optics, (image, depth) = camera(), scene(24, 24)
+        optics.field_center = center
+        with pytest.raises(error, match=message):
+            optics(image, depth)
+
     def test_exception_compiling(self):
         optics, (image, depth) = camera(), scene(24, 24)
         with pytest.raises(Exception, match="a camera behind a real lens cannot be compiled or exported"):
