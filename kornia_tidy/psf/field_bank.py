@@ -173,16 +173,20 @@ def field_psf_bank(
             continue
         axis, *turned = turned_lenses(lens, metres, defocus, wavelength)
         on_axis = lens_light(whole_cells(pupil), pupil.transmission, axis, sensor.tolerance).to(weights)
-        for f, (there, shifts) in enumerate(zip(turned, apart, strict=True)):
-            shown = weights, pupil.transmission, there, sensor
+        for f, (seen_there, shifts) in enumerate(zip(turned, apart, strict=True)):
+            shown = weights, pupil.transmission, seen_there, sensor
             energies, area = lens_psfs(screens[w], *shown, shifts[w, seen].tolist())
             share = area / on_axis
-            psfs[f] = psfs[f] + torch.einsum("pv,d,dvyx->dpyx", mixing, share, energies)
-            light[f] = light[f] + torch.einsum("pv,d->dp", mixing, share)
-    whole, lit = torch.stack(psfs), torch.stack(light)
-    energy = whole.sum((-2, -1)) / torch.where(lit == 0, torch.ones_like(lit), lit)
+            lit = share[:, None, None, None] * energies
+            for v, weights_of_planes in enumerate(
+                mixing.T
+            ):  # no matrix product: its order follows the number of depths
+                psfs[f] = psfs[f] + weights_of_planes[:, None, None] * lit[:, v, None]
+                light[f] = light[f] + share[:, None] * weights_of_planes
+    whole, there = torch.stack(psfs), torch.stack(light)
+    energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
     points = phase.new_tensor([list(point) for point in field])
-    return FieldBank(whole, phase.new_tensor(defocus), points, energy, lit)
+    return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
 
 
 def field_light(

@@ -240,9 +240,10 @@ class TestLensCaptures(BaseTester):
         made.sensor, made.field_center = None, optics.field_center
         assert torch.equal(made(image, depth), optics(image, depth))
 
+    @pytest.mark.parametrize("double", [False, True])
     @torch.no_grad()
-    def test_feature_a_psf_does_not_depend_on_those_computed_with_it(self):
-        model = camera().psf_model
+    def test_feature_a_psf_does_not_depend_on_those_computed_with_it(self, double):
+        model = camera(fidelity=SETTINGS.replace(double=double)).psf_model
         together = model.psf_bank(defocus=[-19.0, -3.0, 2.0, 20.0], field=[(0.0, 0.0), CORNER])
         alone = model.psf_bank(defocus=[2.0], field=[CORNER])
         assert torch.equal(alone.psfs[0, 0], together.psfs[1, 2])
