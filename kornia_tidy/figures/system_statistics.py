@@ -7,7 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_tidy.mask_design.fisher_information import crlb
 from kornia_tidy.psf.psf_model import PSFModel
 
 
@@ -39,6 +38,8 @@ def system_statistics(lens: PSFModel, nodes: int = 49, frequencies: int = 32) ->
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
     """
+    from kornia_tidy.mask_design.fisher_information import crlb  # noqa: PLC0415 (contrast does not need the design of masks)
+
     lo, hi = lens.camera.defocus_range
     defocus = torch.linspace(lo, hi, nodes, dtype=torch.float64)
     psfs = lens.psf_bank(defocus=defocus.tolist()).psfs
