@@ -11,6 +11,7 @@ pairs interpolate the PSF as well as these. So a few pairs tell, in milliseconds
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 
 import torch
@@ -50,7 +51,7 @@ def field_nodes(
         wavelength: the shortest, in metres.
         pixel_pitch: of the sensor in metres.
         reach: pixels from the PSF's middle within which most of its light falls.
-        tolerance: relative error of the PSFs.
+        tolerance: relative error of the PSFs. A warning tells where :data:`MOST_NODES` leave more.
 
     Example:
         >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2)
@@ -60,7 +61,7 @@ def field_nodes(
         >>> field_nodes((64, 64), (0.0, 0.0), lens, *given).nodes
         (1, 1)
     """
-    found, cell = [], CELLS[0]
+    found, cell, beyond = [], CELLS[0], 0.0
     for axis in (0, 1):
         half = (size[axis] - 1) / 2
         errors = torch.zeros(MOST_NODES + 1, dtype=torch.float64)
@@ -74,7 +75,16 @@ def field_nodes(
             bent = [bend * (side / max(2 * half, 1)) ** 2 for side in CELLS]
             cell = min(cell, next((side for side, b in zip(CELLS, bent, strict=True) if b <= tolerance), CELLS[-1]))
         enough = (errors[1:] <= tolerance).nonzero()
+        beyond = max(beyond, 0.0 if len(enough) else float(errors[-1]))
         found.append(int(enough[0]) + 1 if len(enough) else MOST_NODES)
+    if beyond:
+        warnings.warn(
+            f"PSFs of the lens {lens.name!r} vary so much over {size[0]}x{size[1]} px that {MOST_NODES} places along a "
+            f"side leave a relative error of {beyond:.2g}, more than the field_tolerance of {tolerance:.2g}: take a "
+            f"smaller picture or aperture",
+            UserWarning,
+            stacklevel=3,
+        )
     return Field(size, (found[0], found[1]), center, cell=cell)
 
 

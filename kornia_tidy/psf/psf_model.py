@@ -62,7 +62,7 @@ class Derived:
         self.pupil: Pupil | None = None
         self.blur: WideBlur | None = None
         self.blur_known = False
-        self.fields: dict[tuple[tuple[int, int], tuple[float, float]], Field] = {}
+        self.fields: dict[object, Field] = {}  # by size and place of the picture, and what else they follow from
         self.light: tuple[object, Tensor] | None = None  # over the field, and what for
         self.lit: tuple[PSFBank, FieldBank] | None = None  # the last PSFs, and the same with their light
 
@@ -336,11 +336,12 @@ class PSFModel:
         """
         bank, derived = self.scene_bank(channels, dtype, defocus, points=field.points), self._derived
         if (known := derived.lit) is None or known[0] is not bank:
-            asked = bank.defocus.tolist(), field.points, channels
-            if derived.light is None or derived.light[0] != asked:
-                given = self.pupil, self.spectrum_of(channels).flat(), *asked[:2], cast("Lens", self.lens)
-                derived.light = asked, field_light(*given, self.camera.pixel_pitch)
-            light = derived.light[1].to(bank.psfs)
+            lens, pitch = cast("Lens", self.lens), self.camera.pixel_pitch
+            asked, found = (bank.defocus.tolist(), field.points, channels, lens.table, pitch), derived.light
+            if found is None or found[0] != asked:
+                given = self.pupil, self.spectrum_of(channels).flat(), *asked[:2], lens, pitch
+                found = derived.light = asked, field_light(*given)
+            light = found[1].to(bank.psfs)
             light = light.repeat_interleave(bank.psfs.shape[1] // light[:, 0].numel(), 2)
             each, within = (-1, light.shape[-1]), light.movedim(1, 0)
             psfs = bank.psfs.unflatten(1, each) * within[..., None, None]
@@ -369,17 +370,17 @@ class PSFModel:
                 "a camera behind a real lens cannot be compiled or exported: call it from outside of torch.compile, or "
                 "leave lens= out"
             )
-        known, center = self._derived.fields, check_center(center)
-        if (size, center) not in known:
+        known, lens, camera, center = self._derived.fields, self.lens, self.camera, check_center(center)
+        asked = size, center, lens.table, camera.pixel_pitch, camera.defocus_range
+        if (field := known.get(asked)) is None:
             rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
             corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
-            self._warn_if_beyond(corners, self.camera.defocus_range)
-            reach, wavelength = self.window / 4, min(self._sampled.wavelengths)
-            given = self.camera.defocus_range, wavelength, self.camera.pixel_pitch, reach
-            known[size, center] = field_nodes(size, center, self.lens, *given, self.fidelity.field_tolerance)
+            self._warn_if_beyond(corners, camera.defocus_range)
+            given = camera.defocus_range, min(self._sampled.wavelengths), camera.pixel_pitch, self.window / 4
+            field = known[asked] = field_nodes(size, center, lens, *given, self.fidelity.field_tolerance)
             if len(known) > MOST_FIELDS:
-                known.pop(next(iter(known)), None)
-        return known[size, center]
+                known.pop(next(iter(list(known))), None)
+        return field
 
     def group_bank(
         self, channels: int, dtype: torch.dtype, group: BlurGroup, nodes: tuple[float, ...] | None = None

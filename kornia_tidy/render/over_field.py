@@ -95,13 +95,11 @@ class _Steps:
         pixels: of the plane.
         middle: of the cell in the picture, (1,).
         offset: of the pixels from the middle.
-        mixing: (3, 2 nx) how value and slopes of a cell follow from values and slopes at the nodes along a row.
     """
 
     pixels: slice
     middle: Tensor
     offset: Tensor
-    mixing: Tensor
 
 
 class _Cells:
@@ -113,14 +111,14 @@ class _Cells:
         self.psfs = bank.psfs.movedim(1, 0).contiguous()  # (D, F, C, P, P)
         self.light = bank.light.movedim(1, 0)  # (D, F, C)
 
-    def _columns(self, deep: Tensor, margin: int) -> list[_Steps]:
-        """Return the cells along a row; value and slopes there follow from those at the nodes by ``mixing``."""
+    def _columns(self, deep: Tensor, margin: int) -> list[tuple[_Steps, Tensor]]:
+        """Return the cells along a row, and how value and slopes there follow from those at its nodes, (3, 2 nx)."""
         found = []
         for across in self._steps(1, deep, margin):
             weights, slopes = self.field.along(1, across.middle)
             none = torch.zeros_like(weights)
             mixing = torch.cat([torch.cat([weights, none, slopes]), torch.cat([none, weights, none])], 1)
-            found.append(replace(across, mixing=mixing.to(self.psfs)))
+            found.append((across, mixing.to(self.psfs)))
         return found
 
     def see(self, plane: Tensor, deep: Tensor, inside: Tensor | None = None) -> Tensor:
@@ -128,17 +126,18 @@ class _Cells:
         radius, lines, columns = self.radius, [], self._columns(deep, self.radius)
         for down, line in self._lines(deep, radius):
             parts = []
-            for across in columns:
+            for across, mixing in columns:
                 around = ..., _wider(down.pixels, radius), _wider(across.pixels, radius)
                 window, depths = plane[around], deep[around]
                 own = self._layers(cropped(depths, radius) if self.rendering.compositing == "gather" else depths)
                 if self.rendering.compositing == "gather":
-                    psfs = self._psfs(line, across, own).flatten(1, 2)
+                    psfs = self._psfs(line, mixing, own).flatten(1, 2)
                     seen = self._rendered(window.repeat(1, 3, 1, 1), depths, own, psfs, "valid")
                     parts.append(_blended(seen.unflatten(1, (3, -1)), down, across))
                 else:
                     dark = None if inside is None else inside[around]
-                    parts.append(self._occluded(window, depths, dark, own, line, down, across))
+                    psfs, light = self._psfs(line, mixing, own), self._light(down, mixing, own)
+                    parts.append(self._occluded(window, depths, dark, own, psfs, light, down, across))
             lines.append(torch.cat(parts, -1))
         return torch.cat(lines, -2)
 
@@ -148,10 +147,10 @@ class _Cells:
         columns = self._columns(deep, 0)
         total = plane.new_zeros(*plane.shape[:2], *(side + 2 * radius for side in plane.shape[-2:]))
         for down, line in self._lines(deep, 0):
-            for across in columns:
+            for across, mixing in columns:
                 window, depths = (x[..., down.pixels, across.pixels] for x in (plane, deep))
                 own = self._layers(depths)
-                psfs = self._psfs(line, across, own).flatten(1, 2)
+                psfs = self._psfs(line, mixing, own).flatten(1, 2)
                 parts = torch.cat([window, down.offset[:, None] * window, across.offset * window], 1)
                 parts, depths = pad(parts, (radius,) * 4), pad(depths, (radius,) * 4, mode="replicate")
                 spread = self._rendered(parts, depths, own, psfs, "zero").unflatten(1, (3, -1)).sum(1)
@@ -164,16 +163,16 @@ class _Cells:
         depths: Tensor,
         inside: Tensor | None,
         own: slice,
-        line: tuple[int, Tensor],
+        psfs: Tensor,
+        light: Tensor,
         down: _Steps,
         across: _Steps,
     ) -> Tensor:
         """Return what pixels of a cell see of layers that hide one another, see :func:`lay_over`."""
         index, weight = assign_layers(depths, self.bank.defocus[own], self.rendering.layers)
         shown = None if self.rendering.layers == "nearest" else weight.double()
-        psfs = self._psfs(line, across, own).double()  # (D, 3, C, P, P)
-        psfs = psfs.flip((-2, -1)) if self.rendering.correlate else psfs
-        lit = _blended(self._light(down, across, own)[..., None, None], down, across)  # (D, C, h, w)
+        psfs = (psfs.flip((-2, -1)) if self.rendering.correlate else psfs).double()  # (D, 3, C, P, P)
+        lit = _blended(light[..., None, None], down, across)  # (D, C, h, w)
         size, side = (window.shape[-2], window.shape[-1]), psfs.shape[-1]
 
         def blur(planes: Tensor, spectrum: Tensor) -> Tensor:
@@ -203,17 +202,17 @@ class _Cells:
             rows = (weights @ whole[own]).view(own.stop - own.start, 2 * self.field.nodes[1], -1)
             yield down, (own.start, rows)
 
-    def _psfs(self, line: tuple[int, Tensor], across: _Steps, own: slice) -> Tensor:
+    def _psfs(self, line: tuple[int, Tensor], mixing: Tensor, own: slice) -> Tensor:
         """Return value and slopes of the PSFs of a cell, (D, 3, C, P, P)."""
         first, rows = line
         part = rows[own.start - first : own.stop - first]
-        return (across.mixing @ part).unflatten(2, self.psfs.shape[2:])
+        return (mixing @ part).unflatten(2, self.psfs.shape[2:])
 
-    def _light(self, down: _Steps, across: _Steps, own: slice) -> Tensor:
+    def _light(self, down: _Steps, mixing: Tensor, own: slice) -> Tensor:
         """Return value and slopes of the relative illumination of a cell, (D, 3, C)."""
         weights = torch.cat(self.field.along(0, down.middle)).to(self.light)
         rows = weights @ self.light[own].unflatten(1, self.field.nodes).flatten(2)
-        return across.mixing @ rows.unflatten(2, (self.field.nodes[1], -1)).flatten(1, 2)
+        return mixing @ rows.unflatten(2, (self.field.nodes[1], -1)).flatten(1, 2)
 
     def _steps(self, axis: int, deep: Tensor, margin: int) -> Iterator[_Steps]:
         """Yield the cells along an axis. They stand at the same places of the picture whatever part of it is seen."""
@@ -223,7 +222,7 @@ class _Cells:
         for cell, count in zip(*torch.unique_consecutive(places // side, return_counts=True), strict=True):
             pixels = slice(first, first := first + int(count))
             middle = (cell * side + (cell * side + side).clamp(max=size) - 1) / 2
-            yield _Steps(pixels, middle[None], (places[pixels] - middle).to(self.psfs), middle)
+            yield _Steps(pixels, middle[None], (places[pixels] - middle).to(self.psfs))
 
     def _layers(self, depths: Tensor) -> slice:
         """Return the layers that pixels need; all where one would have to wait for their values."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -249,6 +250,21 @@ class TestLensCaptures(BaseTester):
         # But for rounding: polynomials are summed in an order that follows the number of depths.
         bound = (1e-12 if double else 1e-6) * float(alone.psfs.max())
         self.assert_close(alone.psfs[0, 0], together.psfs[1, 2], rtol=0, atol=bound)
+
+    def test_exception_more_places_than_there_are_warn(self):
+        model = camera(fidelity=SETTINGS.replace(field_tolerance=1e-7)).psf_model
+        with pytest.warns(UserWarning, match=r"vary so much over 1110x1282 px that 13 places along a side leave a rel"):
+            assert max(model.field_of((1110, 1282)).nodes) == 13
+
+    @torch.no_grad()
+    def test_feature_threads_with_pictures_of_other_sizes(self):
+        optics, scenes = camera(center=(450.0, 520.0)), [scene(24, 24 + 2 * i, seed=i) for i in range(4)]
+        alone = [camera(center=(450.0, 520.0))(*each) for each in scenes]
+        with ThreadPoolExecutor(4) as pool:
+            take = torch.no_grad()(lambda each: optics(*each))  # a thread records gradients unless it is told
+            together = list(pool.map(take, scenes * 3))
+        for i, capture in enumerate(together):
+            self.assert_close(capture, alone[i % 4], rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize(
         ("center", "error", "message"),
