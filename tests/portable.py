@@ -37,6 +37,7 @@ COMPILED = (  # what calls the C kernels
     "tests/kernels",
     "tests/render",
     "tests/psf",
+    "tests/camera/test_lens_captures.py",
     "tests/camera/test_tidy_optics.py",
     "tests/camera/test_motion.py",
     "tests/camera/test_burst.py",
