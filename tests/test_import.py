@@ -9,7 +9,7 @@ import pytest
 
 from tests.base import BaseTester
 
-HEAVY = ("colour", "matplotlib", "rawpy", "h5py", "lightning", "torch._dynamo")
+HEAVY = ("colour", "matplotlib", "rawpy", "h5py", "lightning", "scipy", "sympy", "torch._dynamo")
 LISTED = f"""
 import sys
 import cv2, kornia, torch
@@ -19,6 +19,23 @@ print(*sorted({{name.partition(".")[0] for name in set(sys.modules) - before}} -
 kornia_tidy.TiDyOptics
 print(*(name for name in {HEAVY} if name in sys.modules and name not in before))
 print(*sorted({{name.partition(".")[0] for name in set(sys.modules) - before}} - set(sys.stdlib_module_names)))
+"""
+ADDED = f"""
+import sys
+import kornia
+before = set(sys.modules)
+import kornia_tidy.augmentation
+added = set(sys.modules) - before
+print(len(added))
+print(*(name for name in {HEAVY} if name in added))
+"""
+WORDS = """
+import contextlib, io, sys
+from kornia_tidy.cli import main
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    main(sys.argv[1:])
+print(len(sys.modules))
+print(*(name for name in ("torch", "numpy", "kornia", "cv2") if name in sys.modules))
 """
 
 
@@ -41,3 +58,18 @@ class TestImport(BaseTester):
     def test_feature_no_other_package_is_added_to_those_of_every_pipeline(self, imported):
         assert imported.stdout.splitlines()[0] == "kornia_tidy"
         assert imported.stdout.splitlines()[2] == "kornia_tidy safetensors"
+
+    def test_feature_augmentations_add_their_own_modules_to_those_of_kornia(self):
+        """154 modules on 2026-11-28, a fifth of a second; ``torch._dynamo`` by itself brought 820 of them."""
+        count, heavy = python("-c", ADDED).stdout.splitlines()
+        assert int(count) < 250
+        assert heavy == ""
+
+    @pytest.mark.parametrize("words", ["--help", "--version", "train --help", "train --task depht", "raw --help"])
+    def test_feature_help_comes_without_torch(self, words):
+        """At most 196 modules on 2026-11-28, a tenth of a second; torch by itself brings 1500."""
+        done = python("-c", WORDS, *words.split())
+        count, heavy = done.stdout.splitlines()
+        assert int(count) < 260
+        assert heavy == ""
+        assert len(done.stderr.splitlines()) <= 3

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.ranges import check_probability
-from kornia_tidy.augmentation.rows import changed_rows
+from kornia_tidy.augmentation.rows import changed_rows, outside_graphs
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.optics.holes import HOLES, fill_holes
@@ -183,7 +183,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         finally:
             self.bound = before
 
-    @torch.compiler.disable  # which rows are computed depends on values
+    @outside_graphs  # which rows are computed depends on values
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:

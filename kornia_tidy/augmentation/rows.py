@@ -3,12 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import wraps
 from typing import Any
 
 import torch
 from torch import Tensor
 
 _SEEDS = 2**31  # whole numbers that a cast of the parameters to float64 keeps
+
+
+def outside_graphs(method: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Keep a method out of the graphs of ``torch.compile``, as ``torch.compiler.disable`` does.
+
+    That decorator imports ``torch._dynamo``, which takes a second. This one imports it while a caller is compiled.
+
+    Args:
+        method: runs as Python code, eagerly.
+
+    Example:
+        >>> outside_graphs(torch.neg)(torch.ones(1))
+        tensor([-1.])
+    """
+
+    @wraps(method)
+    def call(*arguments: Any, **options: Any) -> Tensor:
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(method)(*arguments, **options)
+        return method(*arguments, **options)
+
+    return call
 
 
 def changed_rows(

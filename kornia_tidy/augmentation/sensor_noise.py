@@ -11,7 +11,7 @@ from kornia.augmentation.random_generator import PlainUniformGenerator
 from torch import Tensor
 
 from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range
-from kornia_tidy.augmentation.rows import changed_rows, row_seeds
+from kornia_tidy.augmentation.rows import changed_rows, outside_graphs, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.sensor.noise import SensorNoise
@@ -163,7 +163,7 @@ class RandomSensorNoise(K.IntensityAugmentationBase2D):
         seeds = row_seeds(batch_shape[0], self.same_on_batch)
         return {**super().generate_parameters(batch_shape), "seed": seeds}
 
-    @torch.compiler.disable  # which rows are computed depends on values
+    @outside_graphs  # which rows are computed depends on values
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:

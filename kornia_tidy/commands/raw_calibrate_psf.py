@@ -96,10 +96,9 @@ lowers it as much as twice the number of positions. Without --reference each PSF
 centred at its centroid, and shifts by the masks are not measured.
 
 In Python:
-  bank = PSFBank.load("bank.safetensors")
-  coded = TiDyOptics(camera=..., sensor=...).with_bank(bank)(image, depth)
-  sharp = Tikhonov()(capture, bank)  # of linear light
-  MeasuredPSFs.load("bank.safetensors").uncertainty  # and .distances, .reports of every picture
+  from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs
+  measured = MeasuredPSFs.load("bank.safetensors")  # .bank, .uncertainty, .distances, .reports
+  sharp = Tikhonov()(capture, measured.bank)        # kornia_tidy.reconstruction, on linear light
 """
     examples: ClassVar = """\
   Three distances, 8 places of the point at each:

@@ -77,6 +77,7 @@ class DevelopRaw:
 The first example in Python:
   from kornia_tidy.data.image_files import write_image
   from kornia_tidy.raw.capture import RawCapture
+  from kornia_tidy.raw.develop import develop
   write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
 """
 

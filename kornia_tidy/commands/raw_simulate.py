@@ -117,7 +117,7 @@ class SimulateRaw:
     kornia-tidy raw simulate --points 24 --distance 0.5 --size 1008x672 -o point0.5.dng
 """
     notes: ClassVar = """\
-In Python: simulate_scene(image, depth, TiDyOptics(sensor=None), camera, noise)
+The picture in Python: kornia_tidy.raw.simulation.simulate_scene.
 """
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shlex
 import subprocess
@@ -113,6 +114,14 @@ class TestRegistry(BaseTester):
             argv = shlex.split(re.split(r"   | [>|] ", line.strip(), maxsplit=1)[0])
             assert isinstance(read_command(argv[1:]), ALL[words])
         assert commands or not text
+
+    @every_command
+    def test_feature_python_in_the_notes_finds_its_imports(self, words):
+        text = getattr(ALL[words], "notes", "")
+        for line in re.findall(r"^ *(from kornia_tidy.* import .*)$", text, re.MULTILINE):
+            exec(line, {})
+        for module, name in re.findall(r"\b(kornia_tidy(?:\.[a-z]\w*)+)\.(\w+)", re.sub("from .* import .*", "", text)):
+            assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
 
 
 def required(words, but):
