@@ -16,6 +16,7 @@ from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographi
 from kornia_tidy.data.published_folders import hypersim, kitti, middlebury, scannet, seven_scenes
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
+from kornia_tidy.data.sample_scenes import sample_scene
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
 from kornia_tidy.data.sun_rgbd import SUNRGBD
 from kornia_tidy.data.tum_sequence import TUMSequence
@@ -52,6 +53,7 @@ __all__ = [
     "read_depth",
     "read_image",
     "read_rgbd",
+    "sample_scene",
     "scannet",
     "seven_scenes",
     "split_frames",
