@@ -216,4 +216,4 @@ def _surface(thing: Thing, points: Array, tiles: tuple[Array, Array, Array]) -> 
         colour[np.sin(300 * v) < 0.3] = 0.4
     elif thing.pattern == "checks":
         colour[np.sin(200 * u) * np.sin(200 * v) < 0] *= 0.3
-    return normal, colour
+    return normal.astype(np.float32), colour.astype(np.float32)
