@@ -21,7 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "kornia_tidy"
 CORE = "core"  # the modules at the package's root
-COMMAND_LINE = {"cli": "app", "__main__": "app"}  # they import from the same packages as the topmost one
+COMMAND_LINE = {"__main__": "cli"}  # it imports from the same packages as the topmost one
 MADE = ("outputs/", "dist/")  # folders that make fills and git ignores
 MADE_IN = "docs/architecture.md"
 DOCUMENTS = ("CONTRIBUTING.md", "README.md", "docs/*.md")  # in which file names are checked

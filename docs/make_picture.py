@@ -25,10 +25,10 @@ from torch import Tensor
 
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.figures.explained import single_mask_banks
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.tasks import split_maps
-from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.psf import PSFBank
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.tasks import split_maps
+from kornia_tidy.reconstruction.trained import TrainedSystem
 
 PICTURE = Path(__file__).resolve().parent / "images" / "camera.png"
 WIDTH, HEIGHT, DOTS = 12.0, 5.3, 110  # inches, dots an inch: 1320 x 583 pixels

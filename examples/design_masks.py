@@ -35,8 +35,8 @@ import torch
 from matplotlib.figure import Figure
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum
-from kornia_tidy.mask_design.fisher_information import crlb
-from kornia_tidy.mask_design.objectives import design, restoration_error
+from kornia_tidy.design.fisher_information import crlb
+from kornia_tidy.design.objectives import design, restoration_error
 from kornia_tidy.masks import CubicMask, PhaseMasks, SpiralMask, ZernikeMask
 from kornia_tidy.psf.psf_model import PSFModel
 

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.mask_design import objectives
+from kornia_tidy.design import objectives
 
 # Light that leaves the window is lost, not given back: a PSF is not rewarded for throwing light far away.
 FIDELITY = Fidelity("point", pixel_tolerance=0.1, layer_spacing=5.0, window=23, stray_light="discard")

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.trained import load_weights
+from kornia_tidy.reconstruction.trained import load_weights
 
 
 class OwnNetwork(nn.Module):

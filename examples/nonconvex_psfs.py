@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from kornia_tidy import PixelwiseMask
-from kornia_tidy.mask_design.non_convexity import autocorrelation_bound, extreme_points
+from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.optics.aperture import circular_aperture
 
 

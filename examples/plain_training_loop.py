@@ -9,9 +9,9 @@ import torch
 
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.heads import PlainHead
-from kornia_tidy.inference.tasks import normalised_inverse_depth
+from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.losses import mse_loss
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 
 
 def main(arguments: list[str] | None = None) -> list[float]:

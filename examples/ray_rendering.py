@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 
-from kornia_tidy.coded_datasets import Layout, render_scenes
-from kornia_tidy.commands.render import OF_CAMERA, OF_SCENES
-from kornia_tidy.inference.trained import build_optics
+from kornia_tidy.cli.commands.render import OF_CAMERA, OF_SCENES
+from kornia_tidy.reconstruction.trained import build_optics
+from kornia_tidy.training.coded_datasets import Layout, render_scenes
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.settings import TrainingSettings
 

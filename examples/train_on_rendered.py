@@ -15,9 +15,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from kornia_tidy import TiDyOptics
-from kornia_tidy.coded_datasets import CodedCaptures, Layout, render_scenes
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.heads import PlainHead
+from kornia_tidy.reconstruction.heads import PlainHead
+from kornia_tidy.training.coded_datasets import CodedCaptures, Layout, render_scenes
 
 
 def main(arguments: Sequence[str] | None = None) -> list[float]:

@@ -5,14 +5,15 @@ The names below are imported when they are first asked for, so that the help of 
 
 from __future__ import annotations
 
-from kornia_tidy.runtime.signals import end_on_signals, is_command
+from kornia_tidy.signals import end_on_signals, is_command
 
 if is_command():
     end_on_signals()  # during the imports that follow, which take seconds
 
-from importlib import import_module
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from kornia_tidy.lazy import importer
+from kornia_tidy.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from kornia_tidy.augmentation.arrays import reconstruct, simulate
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
     from kornia_tidy.psf.psf_bank import PSFBank
     from kornia_tidy.sensor.noise import SensorNoise
-
-__version__ = "0.1.0"
 
 __all__ = [
     "DefocusRange",
@@ -69,19 +68,7 @@ _MODULES = {
     "psf.psf_bank": ("PSFBank",),
     "sensor.noise": ("SensorNoise",),
 }
-_HOMES = {name: module for module, names in _MODULES.items() for name in names}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name, or a package, when it is first asked for."""
-    if name in _HOMES:
-        value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
-    elif not name.startswith("_") and find_spec(f"{__name__}.{name}"):
-        value = import_module(f"{__name__}.{name}")
-    else:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value
-    return value
+__getattr__ = importer(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

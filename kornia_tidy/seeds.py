@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 
+import torch
+
 
 def keyed_seed(*keys: int | str) -> int:
     """Return a seed determined by these keys alone; similar keys give unrelated seeds.
@@ -14,3 +16,14 @@ def keyed_seed(*keys: int | str) -> int:
     """
     digest = hashlib.sha256("/".join(map(str, keys)).encode()).digest()
     return int.from_bytes(digest[:8], "little") >> 1  # 63 bits are valid for every generator
+
+
+def item_generator(seed: int, item: int) -> torch.Generator:
+    """Return a generator that depends on a seed and an item's number only; neighbours are unrelated.
+
+    Example:
+        >>> int(torch.randint(100, (1,), generator=item_generator(0, 1)))
+        33
+    """
+    digest = hashlib.sha256(f"{seed}/{item}".encode()).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little", signed=True))

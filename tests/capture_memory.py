@@ -9,7 +9,7 @@ import sys
 SCRIPT = """
 import sys, warnings, torch
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.planning.planner import Planner
+from kornia_tidy.accuracy.planner import Planner
 import torch._dynamo  # counted as no part of the capture
 warnings.simplefilter("ignore")
 def peak():

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 
 from kornia_tidy import PixelwiseMask, PSFBank, ThinLensCamera, TiDyOptics
-from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
-from kornia_tidy.calibration.psf import MeasuredPSFs
+from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs
 from kornia_tidy.masks import initial_heights
 
 DISTANCES = (2.5, 0.9, 0.55, 0.4)  # metres, by rising defocus

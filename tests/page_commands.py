@@ -24,7 +24,7 @@ from unittest.mock import patch
 
 import pytest
 
-from kornia_tidy.cli import read_command
+from kornia_tidy.cli.command_line import read_command
 
 ROOT = Path(__file__).resolve().parents[1]
 STOPS = {"|", "||", "&&", ";", ">"}  # what ends a command in a recipe of make

@@ -41,35 +41,35 @@ COMPILED = (  # what calls the C kernels
     "tests/camera/test_tidy_optics.py",
     "tests/camera/test_motion.py",
     "tests/camera/test_burst.py",
-    "tests/planning/test_error_model.py",
-    "tests/planning/test_rendering_cost.py",
+    "tests/accuracy/test_error_model.py",
+    "tests/accuracy/test_rendering_cost.py",
     "tests/camera/test_pipelines_captures.py",
-    "tests/systems/test_presets.py",
+    "tests/camera/test_published_systems.py",
 )
 TRANSFORMS = (  # and matrix products
     *COMPILED,
     "tests/optics",
     "tests/masks",
     "tests/modulator",
-    "tests/mask_design",
-    "tests/calibration",
+    "tests/design",
+    "tests/lab/calibration",
     "tests/reconstruction/test_tikhonov.py",
     "tests/reconstruction/test_tikhonov_modules.py",
     "tests/reconstruction/test_periodic.py",
     "tests/reconstruction/test_refocused.py",
-    "tests/planning/test_planner.py",
+    "tests/accuracy/test_planner.py",
 )
 NUMBERS = (
     *TRANSFORMS,
     "tests/reconstruction",
     "tests/sensor",
-    "tests/raw",
+    "tests/lab/raw",
     "tests/training/test_designed.py",
     "tests/training/test_evaluation.py",
     "tests/training/test_module.py",
     "tests/training/test_noisy_crops.py",
     "tests/training/test_parts.py",
-    "tests/inference/test_pretrained.py",
+    "tests/reconstruction/test_pretrained.py",
 )
 
 WIDTHS = "widths"  # of vectors, compared with one another: not a factor that tests run under

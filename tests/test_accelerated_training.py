@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.nafnet import NAFNet
+from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.settings import TrainingSettings
 from kornia_tidy.training.task_loss import psnr_ssim_loss
 from tests.base import BaseTester

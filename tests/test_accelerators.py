@@ -10,10 +10,10 @@ import torch
 from torch import nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import pupil_field
 from kornia_tidy.render.compositing import gather
-from kornia_tidy.systems import SYSTEMS
 from tests.base import BaseTester
 from tests.benchmarks.launches import step_counts
 from tests.simulated_device import DEVICE, SimulatedDevice

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = """
 [importlinter:contract:layers]
 layers =
-    cli
+    (__main__)
     commands : (app)
     camera
     optics
@@ -25,7 +25,7 @@ layers =
 MARKERS = "<!-- made: diagram --><!-- end: diagram -->\n<!-- made: packages --><!-- end: packages -->\n"
 FILES = {
     "__init__.py": "from kornia_tidy.camera.whole import Camera",
-    "cli.py": "import kornia_tidy.commands.show",
+    "__main__.py": "import kornia_tidy.commands.show",
     "seeds.py": '"""Seeds. And more."""',
     "commands/__init__.py": '"""What a shell\ncalls."""',
     "commands/show.py": "from kornia_tidy.camera.whole import Camera\ndef show():\n    import kornia_tidy.optics.lens",

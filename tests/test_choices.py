@@ -6,25 +6,25 @@ import pytest
 
 from kornia_tidy import choices
 from kornia_tidy.camera import camera_state
-from kornia_tidy.coded_datasets import layout
+from kornia_tidy.design.tradeoff.sweep_settings import PLAN, SWEEP_VALUES
 from kornia_tidy.fidelity import PRESETS
-from kornia_tidy.inference.pretrained import FOLDER
-from kornia_tidy.inference.tasks import MAPS
-from kornia_tidy.mask_export import placement
+from kornia_tidy.lab.mask_export import placement
+from kornia_tidy.lab.raw.color import ADAPTATIONS
+from kornia_tidy.lab.raw.demosaic import METHODS
+from kornia_tidy.lab.raw.develop import HIGHLIGHTS
 from kornia_tidy.modulator import switching
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens import NAMED_LENSES
+from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.psf import psf_bank
-from kornia_tidy.raw.color import ADAPTATIONS
-from kornia_tidy.raw.demosaic import METHODS
-from kornia_tidy.raw.develop import HIGHLIGHTS
 from kornia_tidy.reconstruction import metrics
+from kornia_tidy.reconstruction.pretrained import FOLDER
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
+from kornia_tidy.reconstruction.tasks import MAPS
 from kornia_tidy.render import borders, compositing
 from kornia_tidy.settings import settings_of
-from kornia_tidy.systems.presets import SYSTEMS
-from kornia_tidy.tradeoff.sweep_settings import PLAN, SWEEP_VALUES
 from kornia_tidy.training import data_sets, noisy_crops, settings, task_loss
+from kornia_tidy.training.coded_datasets import layout
 from tests.base import BaseTester
 
 

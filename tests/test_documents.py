@@ -31,8 +31,8 @@ from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
 from tests.data.published import write_each
-from tests.inference.test_baselines import tiny
 from tests.page_commands import check_arguments, check_command, make_checkout, run_in_checkout
+from tests.reconstruction.test_baselines import tiny
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [

@@ -15,7 +15,7 @@ from kornia_tidy.cli import main
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from tests.base import BaseTester
-from tests.coded_datasets.samples import contents
+from tests.training.coded_datasets.samples import contents
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))

@@ -12,7 +12,7 @@ import torch
 
 from kornia_tidy import PSFBank, TiDyOptics, moving_capture
 from kornia_tidy.data import write_depth, write_image
-from kornia_tidy.mask_export import write_heights
+from kornia_tidy.lab.mask_export import write_heights
 from tests.base import BaseTester
 from tests.operations import OPERATIONS
 from tests.test_kinds import argument, bound

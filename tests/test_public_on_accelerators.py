@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.coded_datasets import CodedCaptures, render_scenes
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.reconstruction import (
     JointHead,
@@ -22,6 +21,7 @@ from kornia_tidy.reconstruction import (
     metrics,
 )
 from kornia_tidy.reconstruction.nafnet import NAFNet
+from kornia_tidy.training.coded_datasets import CodedCaptures, render_scenes
 from tests.base import BaseTester
 from tests.operations import OPERATIONS, bank_for
 from tests.reconstruction import test_closed_form_head, test_head, test_joint_closed_form, test_layered_joint

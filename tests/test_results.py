@@ -14,13 +14,13 @@ import torch
 from scipy import stats
 from torch import nn
 
-from kornia_tidy.inference.hub import save_pretrained
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.trained import TrainedSystem, build_head, build_optics
-from kornia_tidy.mask_design.candidates import FLAT as FLAT_LENS
+from kornia_tidy.design.candidates import FLAT as FLAT_LENS
 from kornia_tidy.reconstruction import self_ensemble
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.hub import save_pretrained
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.settings import SystemSettings
+from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics
 from tests.base import BaseTester
 from tests.benchmarks import depth_uncertainty
 from tests.benchmarks.fit_temperature import temperature_by_moments
@@ -146,7 +146,7 @@ class TestSystems(BaseTester):
         assert of_trained("a", trained).digest != before
 
     def test_feature_a_checkpoint_is_named_as_its_folder(self, tmp_path):
-        from kornia_tidy.inference.pretrained import FOLDER
+        from kornia_tidy.reconstruction.pretrained import FOLDER
 
         (tmp_path / "mine").mkdir()
         shutil.copy(FOLDER / "edof-0.safetensors", tmp_path / "mine" / "best.safetensors")

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.calibration.noise.photon_transfer import read_json as read_noise
 from kornia_tidy.cli import main
-from kornia_tidy.coded_datasets.index import read_index
 from kornia_tidy.data import NYUDepthV2, TUMSequence, described_folder
 from kornia_tidy.data.calibration_files import read_calibration
+from kornia_tidy.design.tradeoff import read_csv, write_csv
 from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.files import read_text
-from kornia_tidy.mask_export import SLMFrames, read_slm_frames, write_slm_frames
+from kornia_tidy.lab.calibration.noise.photon_transfer import read_json as read_noise
+from kornia_tidy.lab.mask_export import SLMFrames, read_slm_frames, write_slm_frames
 from kornia_tidy.modulator import GreyLevels
-from kornia_tidy.tradeoff import read_csv, write_csv
 from kornia_tidy.training.callbacks import drop_rows_after
+from kornia_tidy.training.coded_datasets.index import read_index
 from kornia_tidy.training.record import training_record
 from tests.base import BaseTester
 from tests.data.published import write_nyu
-from tests.tradeoff.samples import ROW
+from tests.design.tradeoff.samples import ROW
 
 FORMS = ("utf-8-sig", "utf-16", "utf-32", "utf-16-be with mark")
 CALIB = "cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n"

@@ -24,8 +24,8 @@ from examples.paper.shipped import with_parts
 from kornia_tidy import SensorNoise, Switching, ThinLensCamera, TiDyOptics, burst, moving_capture
 from kornia_tidy.camera.motion import moment_times
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.tasks import metres
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.tasks import metres
 
 SWAP, PAUSE, EXPOSURE, READ_NOISE = 2e-3, 8e-3, 0.1, 3.0  # s, s, s, electrons
 EXTENT = {"smoke": (96, 1), "cpu": (192, 3), "gpu": (512, 5), "paper": (512, 5)}

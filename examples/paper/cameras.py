@@ -7,9 +7,9 @@ from typing import Any
 import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
-from kornia_tidy.inference.tasks import metres
-from kornia_tidy.inference.trained import fix_window
 from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.reconstruction.trained import fix_window
 from kornia_tidy.sensor.exposure import exposed_sensor
 
 ELECTRONS, F_NUMBER = 2000.0, 17.6

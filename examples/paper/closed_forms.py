@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from examples.paper.cameras import ELECTRONS, F_NUMBER
 from kornia_tidy import SensorNoise, ThinLensCamera, TiDyOptics
-from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.reconstruction.tasks import MAPS
 from kornia_tidy.sensor import electrons_at
 
 TEMPERATURES = (1.0, 4.0, 16.0, 64.0)
@@ -66,8 +66,8 @@ def depth_limit(optics: TiDyOptics) -> float:
 
     Source: Van Trees, Detection, Estimation, and Modulation Theory I, section 2.4 (Bayesian bound).
     """
-    from kornia_tidy.mask_design.fisher_information import crlb  # noqa: PLC0415
-    from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS  # noqa: PLC0415
+    from kornia_tidy.data.scene_statistics import PHOTOGRAPHS  # noqa: PLC0415
+    from kornia_tidy.design.fisher_information import crlb  # noqa: PLC0415
 
     lens = optics.psf_model
     lo, hi = lens.camera.defocus_range

@@ -24,8 +24,8 @@ from examples.paper.runner import Experiment, Row, Trial, main
 from examples.paper.scenes import BUDGETS, Budget
 from examples.paper.training import best_flat, closed_form_system, prefixed, scores_of, train
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.inference.trained import TrainedSystem, fix_window
 from kornia_tidy.masks.initial_heights import initial_heights
+from kornia_tidy.reconstruction.trained import TrainedSystem, fix_window
 
 FLAT = "best lens without masks"
 NOISE = 0.01  # of full scale, as PhaseCam3D; the paper states none

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 from examples.paper.cameras import REFERENCE
 from kornia_tidy import Fidelity, ThinLensCamera
 from kornia_tidy.data.patches import central_crop
-from kornia_tidy.inference.tasks import metres, normalised_inverse_depth
+from kornia_tidy.reconstruction.tasks import metres, normalised_inverse_depth
 from kornia_tidy.seeds import keyed_seed
 
 BALANCED = Fidelity.preset("balanced")
@@ -113,7 +113,7 @@ def real(most: int, size: int) -> list[dict[str, Any]]:
 
     Depths are stretched over the range of :data:`REFERENCE`; the middle of each picture is kept.
     """
-    from kornia_tidy.inference.tasks import stretched  # noqa: PLC0415
+    from kornia_tidy.reconstruction.tasks import stretched  # noqa: PLC0415
     from tests.scenes import ENTRIES, load_scene  # noqa: PLC0415
 
     scenes = []

@@ -10,7 +10,7 @@ from examples.paper.closed_forms import ClosedForms
 from examples.paper.scenes import Budget, painted, real
 from examples.paper.training import best_temperature, mean_scores, prefixed, system_of
 from kornia_tidy import TiDyOptics
-from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.sensor.exposure import exposed_sensor
 
 ELECTRONS = 57_000.0  # at f/17.6: a noise of 0.002 at a fifth of full scale, in which the systems were trained
@@ -24,7 +24,7 @@ def shipped_scores(name: str, scale: str, **changed: Any) -> Mapping[str, float 
     The network is as it was trained. The closed form is given the PSFs of the changed camera.
 
     Args:
-        name: of the system, see :func:`~kornia_tidy.inference.pretrained.load_pretrained`.
+        name: of the system, see :func:`~kornia_tidy.reconstruction.pretrained.load_pretrained`.
         scale: of the experiment.
         **changed: arguments of :class:`~kornia_tidy.TiDyOptics` that differ from the shipped camera's.
     """

@@ -21,8 +21,8 @@ from examples.paper.runner import Experiment, Row, Trial, main
 from examples.paper.scenes import BUDGETS
 from examples.paper.training import best_flat, constant_depth, prefixed, trained_scores
 from kornia_tidy import TiDyOptics
-from kornia_tidy.inference.trained import fix_window
-from kornia_tidy.systems.presets import published_system
+from kornia_tidy.optics.published_systems import published_system
+from kornia_tidy.reconstruction.trained import fix_window
 
 
 class Peer(NamedTuple):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from examples.paper.report import bars, grid, mean_and_error, means
 from examples.paper.runner import Experiment, Row, Trial, main
-from kornia_tidy.mask_design.non_convexity import autocorrelation_bound
+from kornia_tidy.design.non_convexity import autocorrelation_bound
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.pupil import pupil_field
 from kornia_tidy.seeds import keyed_seed

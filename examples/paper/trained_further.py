@@ -18,8 +18,8 @@ from examples.paper.scenes import Budget, painted, real
 from examples.paper.shipped import ELECTRONS, with_parts
 from examples.paper.training import best_temperature, fit, mean_scores, prefixed, system_of
 from kornia_tidy import TiDyOptics
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.trained import TrainedSystem
 
 AS_SHIPPED = "as shipped"
 Conditions = Mapping[str, Mapping[str, Any]]

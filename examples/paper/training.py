@@ -21,9 +21,9 @@ from examples.paper.cameras import REFERENCE, flat_lens
 from examples.paper.closed_forms import TEMPERATURES, ClosedForms
 from examples.paper.scenes import Budget, ForCamera, painted, scored_sets
 from kornia_tidy import ThinLensCamera, TiDyOptics
-from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.tasks import MAPS, normalised_inverse_depth
-from kornia_tidy.inference.trained import TrainedSystem, build_head, update_psfs
+from kornia_tidy.reconstruction.settings import SystemSettings
+from kornia_tidy.reconstruction.tasks import MAPS, normalised_inverse_depth
+from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, update_psfs
 from kornia_tidy.seeds import keyed_seed
 
 TUNED = 8  # painted scenes on which settings are chosen
@@ -37,7 +37,7 @@ def train(optics: TiDyOptics, task: str, budget: Budget, seed: int, **head: Any)
         task: ``"edof"``, ``"depth"`` or ``"joint"``.
         budget: steps, scenes and learning rates.
         seed: of weights, order and noise.
-        **head: settings of the network, see :class:`~kornia_tidy.inference.settings.SystemSettings`.
+        **head: settings of the network, see :class:`~kornia_tidy.reconstruction.settings.SystemSettings`.
 
     Returns:
         The system in eval mode.

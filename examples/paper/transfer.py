@@ -20,7 +20,7 @@ from examples.paper.report import cell, grid, means
 from examples.paper.runner import Experiment, Row, Trial, main
 from examples.paper.scenes import Budget, painted, real
 from examples.paper.training import best_temperature, mean_scores, prefixed, system_of
-from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.sensor.exposure import exposed_sensor
 
 TRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat")

@@ -15,13 +15,13 @@ from torch import Tensor
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part, described, unmasked
-from kornia_tidy.inference.hub import from_pretrained
-from kornia_tidy.inference.light_head import LightHead, reconstruct_light
-from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
+from kornia_tidy.reconstruction.hub import from_pretrained
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.trained import TrainedSystem
 
 Color = Literal["bgr", "rgb"]
 IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -107,9 +107,9 @@ def reconstruct(
 
     Args:
         capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
-        system: the trained system: a name of :data:`~kornia_tidy.inference.pretrained.PRETRAINED`, or what
-            :func:`~kornia_tidy.inference.hub.from_pretrained` takes or returns. For many calls with a system of your
-            own, a :class:`~kornia_tidy.inference.light_head.LightHead` of it saves the preparation.
+        system: the trained system: a name of :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or what
+            :func:`~kornia_tidy.reconstruction.hub.from_pretrained` takes or returns. For many calls with a system of
+            your own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.
         color: order of the three channels of capture and image.
         linear: True if captures hold linear light, False if they are encoded as sRGB.
         memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.

@@ -15,9 +15,9 @@ from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.ranges import Range, checked_range
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.render.compositing import render
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 SPACING = 0.5  # pixels of radius between two discs; between them the discs are blended
 COLOR_SPACES = ("srgb", "linear")

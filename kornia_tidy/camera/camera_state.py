@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.fidelity import PRESETS, Fidelity
 from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.mode import refuse_torchscript
 from kornia_tidy.modulator.modulator import Timeline
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
@@ -34,7 +35,6 @@ from kornia_tidy.psf.psf_window import FittedWindow
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.runtime.mode import refuse_torchscript
 
 _SUBMODULES = ("masks", "camera", "modulator", "lens", "aperture")
 COLOR_SPACES = ("srgb", "linear", "paper")

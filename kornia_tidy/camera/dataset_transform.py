@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
@@ -16,6 +15,7 @@ from kornia_tidy.camera.samples import with_capture
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.render.repeatable import repeatable
+from kornia_tidy.seeds import item_generator
 
 
 class DatasetTransform:
@@ -138,14 +138,3 @@ class DatasetTransform:
     def __repr__(self) -> str:
         holes = ", holes='fill'" if self.holes == "fill" else ""
         return f"{type(self).__name__}({self.optics!r}, seed={self.seed}, key={self.key!r}{holes})"
-
-
-def item_generator(seed: int, item: int) -> torch.Generator:
-    """Return a generator that depends on a seed and an item's number only; neighbours are unrelated.
-
-    Example:
-        >>> int(torch.randint(100, (1,), generator=item_generator(0, 1)))
-        33
-    """
-    digest = hashlib.sha256(f"{seed}/{item}".encode()).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little", signed=True))

@@ -15,13 +15,13 @@ from torch.utils.data import get_worker_info
 from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_filled
 from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.kernels.precision import widest
+from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
-from kornia_tidy.runtime.mode import Mode, refuse_torchscript, torch_mode
-from kornia_tidy.runtime.precision import widest
 
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.camera_state import COLOR_SPACES, CameraState
 from kornia_tidy.camera.dataset_transform import DatasetTransform
+from kornia_tidy.camera.published_systems import published_parts
 from kornia_tidy.camera.samples import (
     Notes,
     Sample,
@@ -26,6 +27,7 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
+from kornia_tidy.mode import Mode, torch_mode, values_unread
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
@@ -39,13 +41,11 @@ from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.render.dispatch import Explanation, explain
 from kornia_tidy.render.exposure import Rendering, render_pieces
 from kornia_tidy.render.scene import layered_scene
-from kornia_tidy.runtime.mode import Mode, torch_mode, values_unread
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.sensor.sensor import Sensor, check_sensor
-from kornia_tidy.systems.presets import published_system
 
 if TYPE_CHECKING:
-    from kornia_tidy.planning.render_plan import RenderPlan
+    from kornia_tidy.accuracy.render_plan import RenderPlan
 
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
@@ -189,7 +189,7 @@ class TiDyOptics(CameraState):
         Args:
             name: one of ``tidy-5``, ``tidy-1``, ``fresnel``, ``phasecam3d``, ``ikoma2021``, ``chang2019``,
                 ``liu2022-pixelwise``, ``liu2022-spiral`` and ``sitzmann2018``. What each is, and where every value of
-                it was read or guessed, stands in :data:`kornia_tidy.systems.SYSTEMS`.
+                it was read or guessed, stands in :data:`kornia_tidy.optics.SYSTEMS`.
             generator: source of the noise that masks start from, where they do. Default: the global generator.
             overrides: arguments of the class that replace the system's, such as ``fidelity``, ``sensor`` or ``camera``.
 
@@ -210,7 +210,7 @@ class TiDyOptics(CameraState):
             >>> optics.compositing, optics.sensor
             ('occlusion', None)
         """
-        return cls(**published_system(name).parts(generator, **overrides))
+        return cls(**published_parts(name, generator, **overrides))
 
     # ------------------------------------------------------------------ the camera at work
 
@@ -375,7 +375,7 @@ class TiDyOptics(CameraState):
 
     @torch.no_grad()
     def plan(self, depth: Tensor, image: Tensor | None = None, tolerance: float = 1e-3) -> RenderPlan:
-        """Return the cheapest way to capture a scene within an error. See :mod:`kornia_tidy.planning.planner`.
+        """Return the cheapest way to capture a scene within an error. See :mod:`kornia_tidy.accuracy.planner`.
 
         Args:
             depth: (B, 1, H, W) or (1, H, W), as for a capture.
@@ -395,7 +395,7 @@ class TiDyOptics(CameraState):
             >>> plan.predicted_error <= 1e-2
             True
         """
-        from kornia_tidy.planning.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
+        from kornia_tidy.accuracy.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
 
         shape = (len(self.spectrum.weights), *depth.shape[-2:])
         blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image

@@ -1,7 +1,8 @@
-"""Scenes with depth: readers for image and depth files, published data sets, and scenes painted at random.
+"""Scenes with depth: readers for image and depth files, data sets, scenes painted at random, and their statistics.
 
 Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first. Depth of your own with
-unknown pixels goes through :func:`fill_holes`.
+unknown pixels goes through :func:`fill_holes`. ``scene_statistics.py`` has the power spectrum and light of photographs,
+and how their depths are distributed, for mask design and the Wiener filter.
 """
 
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
@@ -18,11 +19,14 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.sample_scenes import sample_scene
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.data.statistics_measurement import measured_statistics
 from kornia_tidy.data.sun_rgbd import SUNRGBD
 from kornia_tidy.data.tum_sequence import TUMSequence
 from kornia_tidy.optics.holes import fill_holes
 
 __all__ = [
+    "PHOTOGRAPHS",
     "SUNRGBD",
     "DeadLeaves",
     "DepthMap",
@@ -34,6 +38,7 @@ __all__ = [
     "RGBDFolder",
     "Scene",
     "SceneDataset",
+    "SceneStatistics",
     "TUMSequence",
     "UnreadableItemError",
     "central_crop",
@@ -44,6 +49,7 @@ __all__ = [
     "from_opencv",
     "hypersim",
     "kitti",
+    "measured_statistics",
     "middlebury",
     "paper_patches",
     "photo_collage",

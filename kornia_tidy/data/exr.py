@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.quiet import caught
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 MAGIC = b"v/1\x01"
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"

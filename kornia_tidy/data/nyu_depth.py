@@ -15,7 +15,7 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_text
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 SOURCES = {

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from kornia_tidy.camera.dataset_transform import item_generator
 from kornia_tidy.data.scene_dataset import Transform, UnreadableItemError, item_index
+from kornia_tidy.seeds import item_generator
 
 
 class Patches(Dataset[Any]):

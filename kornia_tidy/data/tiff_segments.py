@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels, jpeg_frame
 from kornia_tidy.data.tiff_directories import COLUMNS, COMPRESSION, PHOTOMETRIC, ROWS, SAMPLES, Directory
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 BITS, FILL_ORDER, STRIP_OFFSETS, ROWS_PER_STRIP, STRIP_BYTES, PLANES, T4_OPTIONS = 258, 266, 273, 278, 279, 284, 292
 PREDICTOR, TILE_COLUMNS, TILE_ROWS, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT = 317, 322, 323, 324, 325, 339

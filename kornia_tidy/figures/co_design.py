@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from kornia_tidy.design.candidates import FLAT, STARTS, Candidate
+from kornia_tidy.design.simulated_captures import DECISION, candidate_optics
 from kornia_tidy.figures.style import (
     ACCENT,
     DEPTH_COLORS,
@@ -20,14 +22,12 @@ from kornia_tidy.figures.style import (
     quiet,
     require_matplotlib,
 )
-from kornia_tidy.mask_design.candidates import FLAT, STARTS, Candidate
-from kornia_tidy.mask_design.simulated_captures import DECISION, candidate_optics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from kornia_tidy.mask_design.co_design import CoDesign
+    from kornia_tidy.design.co_design import CoDesign
 
 WIDTH, HEIGHT = 11.0, 8.0  # inches
 DEPTHS, SIDE = 7, 41  # PSFs drawn, and their side in pixels
@@ -39,7 +39,7 @@ def draw_co_design(design: CoDesign) -> Figure:
     """Draw a co-design.
 
     Args:
-        design: from :func:`~kornia_tidy.mask_design.co_design.co_design`.
+        design: from :func:`~kornia_tidy.design.co_design.co_design`.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes it 1650 pixels wide.

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.design.compared_cameras import REFERENCE_F_NUMBER, Camera, Result
 from kornia_tidy.figures.comparison import Panel, draw_comparison
 from kornia_tidy.figures.depth import depth_colors
 from kornia_tidy.figures.explained import explain
 from kornia_tidy.figures.style import encoded_figure
-from kornia_tidy.inference.compared_cameras import REFERENCE_F_NUMBER, Camera, Result
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 from kornia_tidy.sensor.exposure import electrons_at

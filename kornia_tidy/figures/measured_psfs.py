@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.calibration.psf.measured_psfs import MeasuredPSFs
-from kornia_tidy.calibration.psf.phase_retrieval import MaskFit
 from kornia_tidy.figures.style import (
     ACCENT,
     BLUE,
@@ -23,6 +21,8 @@ from kornia_tidy.figures.style import (
     TITLE,
     require_matplotlib,
 )
+from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.figures.depth import draw_depth
 from kornia_tidy.figures.style import save_figure
-from kornia_tidy.inference.capture_file import CaptureLight
-from kornia_tidy.inference.light_head import LightHead, Reconstruction, UncertainReconstruction
-from kornia_tidy.inference.tasks import MAPS
+from kornia_tidy.lab.capture_file import CaptureLight
+from kornia_tidy.reconstruction.light_head import LightHead, Reconstruction, UncertainReconstruction
+from kornia_tidy.reconstruction.tasks import MAPS
 
 SMALLEST_DEVIATION = 1e-9  # m
 

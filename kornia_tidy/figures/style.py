@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

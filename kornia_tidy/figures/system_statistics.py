@@ -20,7 +20,7 @@ class SystemStatistics(NamedTuple):
     contrast: Tensor
     """(D, C, F), see :func:`contrast_transfer`."""
     bound: Tensor
-    """(D,) radians, see :func:`~kornia_tidy.mask_design.fisher_information.crlb`."""
+    """(D,) radians, see :func:`~kornia_tidy.design.fisher_information.crlb`."""
 
 
 @torch.no_grad()
@@ -38,7 +38,7 @@ def system_statistics(lens: PSFModel, nodes: int = 49, frequencies: int = 32) ->
         >>> int(seen.contrast.mean((1, 2)).argmax())  # a plain lens is sharpest in the middle, in focus
         2
     """
-    from kornia_tidy.mask_design.fisher_information import crlb  # noqa: PLC0415 (contrast does not need the design of masks)
+    from kornia_tidy.design.fisher_information import crlb  # noqa: PLC0415 (contrast does not need the design of masks)
 
     lo, hi = lens.camera.defocus_range
     defocus = torch.linspace(lo, hi, nodes, dtype=torch.float64)

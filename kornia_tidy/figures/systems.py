@@ -27,8 +27,8 @@ from kornia_tidy.figures.style import (
 )
 from kornia_tidy.figures.system_statistics import SystemStatistics
 from kornia_tidy.masks.base import central_square
+from kornia_tidy.optics.published_systems import System
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.systems.system import System
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

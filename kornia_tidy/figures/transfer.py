@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kornia_tidy.calibration.noise.photon_transfer import ROUNDING, PhotonTransfer
 from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, open_chart, require_matplotlib
+from kornia_tidy.lab.calibration.noise.photon_transfer import ROUNDING, PhotonTransfer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
     """Draw a photon-transfer calibration: points with two standard errors, and the fitted curve.
 
     Args:
-        result: from :func:`~kornia_tidy.calibration.noise.photon_transfer.photon_transfer` or a file.
+        result: from :func:`~kornia_tidy.lab.calibration.noise.photon_transfer.photon_transfer` or a file.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes it 1575 pixels wide.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from kornia_tidy.runtime.search_path import ROOT, find_program
+from kornia_tidy.search_path import ROOT, find_program
 
 THREADS = "-fopenmp"  # PyTorch has brought OpenMP's library along, but a compiler may lack its own
 SECONDS = 120  # to wait for a compiler, which needs two to seven on an idle processor

@@ -19,7 +19,7 @@ from torch import Tensor
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
 from kornia_tidy.kernels.elementwise import call_elementwise
 from kornia_tidy.kernels.shot_noise import drawn_electrons
-from kornia_tidy.runtime.mode import Mode, torch_mode
+from kornia_tidy.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "sensor.c"
 _GIVEN = "Tensor? shot, Tensor? read, Tensor? offset, float full_well, float dark, float sigma, int bits, bool clip"

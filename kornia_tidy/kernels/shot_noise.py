@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from kornia_tidy.runtime.precision import widest
+from kornia_tidy.kernels.precision import widest
 
 # Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
 # is not. Rounded to whole electrons, it differs by 0.025 in total variation at this count (0.040 at 10, 0.018 at 50).

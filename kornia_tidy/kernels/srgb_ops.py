@@ -22,7 +22,7 @@ from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
 from kornia_tidy.kernels.elementwise import call_elementwise
-from kornia_tidy.runtime.mode import Mode, torch_mode
+from kornia_tidy.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "srgb.c"
 

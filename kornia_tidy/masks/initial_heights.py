@@ -35,7 +35,7 @@ FISHER_COEFFICIENTS = (
 def fisher_mask(size: int = 23) -> Tensor:
     """Return the Fisher mask, a mask designed for depth estimation by the Cramér-Rao bound.
 
-    It is the result of :func:`~kornia_tidy.mask_design.objectives.design_fisher_mask` with seed 3.
+    It is the result of :func:`~kornia_tidy.design.objectives.design_fisher_mask` with seed 3.
 
     Args:
         size: pixels N along a side.
@@ -46,7 +46,7 @@ def fisher_mask(size: int = 23) -> Tensor:
     Convention:
         - In the published setting its bound on the error of defocus is 0.0668 rad on average over -10 to 10 rad. That
           of the mask published with PhaseCam3D is 0.0785 rad. See
-          :func:`~kornia_tidy.mask_design.fisher_information.sampled_response`.
+          :func:`~kornia_tidy.design.fisher_information.sampled_response`.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for the method; the mask is our own.
 

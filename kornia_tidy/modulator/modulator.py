@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_part, described, printed
-from kornia_tidy.runtime.mode import refuse_torchscript
+from kornia_tidy.mode import refuse_torchscript
 
 
 class Timeline(NamedTuple):

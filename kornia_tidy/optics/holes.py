@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_part, check_values
-from kornia_tidy.runtime.mode import Mode, torch_mode
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.mode import Mode, torch_mode
+from kornia_tidy.search_path import import_installed
 
 HOLES = ("error", "fill")  # what a camera and its adapters do about holes
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)  # types that torch stores, and neither compares nor gathers

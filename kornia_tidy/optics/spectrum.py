@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 REFERENCE_WAVELENGTH = 530e-9  # m; defocus and mask phase are quoted at this wavelength throughout
 

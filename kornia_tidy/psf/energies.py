@@ -31,7 +31,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.mutual_intensity_ops import SOURCE, mutual_intensity_energies
-from kornia_tidy.runtime.mode import Mode, torch_mode
+from kornia_tidy.mode import Mode, torch_mode
 
 # px, in C: .6 (23 px) to .85 (61 px) of the time of matrix products, beyond 100 px more than they
 LARGEST_WINDOW = 65

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_metres
+from kornia_tidy.kernels.precision import has_float64
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.energies import energy_matrices, intensity_energies, pixel_energies
 from kornia_tidy.psf.propagation import sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
-from kornia_tidy.runtime.mode import Mode, torch_mode
-from kornia_tidy.runtime.precision import has_float64
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_psfs, turned_lenses
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
-from kornia_tidy.runtime.default_device import on_cpu
 
 _LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
 

@@ -17,12 +17,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.field import Field, chebyshev_points, lagrange
 from kornia_tidy.psf.lens_psfs import turned_lenses
-from kornia_tidy.runtime.default_device import on_cpu
 
 MOST_NODES = 13  # along a side
 CELLS = (128, 96, 64, 48, 32, 16)  # px along the side of a cell that sees the change of PSFs to first order

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.lens.lens_table import LensSample, degree_of, modes_of
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrature
@@ -18,7 +19,6 @@ from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.scattered_transform import patches_of, scattered_axis, scattered_energies
-from kornia_tidy.runtime.default_device import on_cpu
 
 _LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
 _BEYOND = 1.5  # times the lens's range, by which PSFs within it may be interpolated

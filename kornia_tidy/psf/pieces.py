@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.window_sides import next_fast_size
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -27,7 +28,6 @@ from kornia_tidy.psf.psf_cache import nodes_around, present_intervals
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 LEAST_BYTES = 12 << 20  # allowed to a piece whatever the budget
 _COPIES = 4  # of PSFs, while a bank is computed, stacked and normalised

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 KINDS = 4  # banks remembered side by side: of RGB and of grey images, in float32 and in float64
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among them, which are no plain attributes

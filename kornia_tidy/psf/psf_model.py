@@ -16,6 +16,7 @@ from kornia_tidy.checks import check_finite, check_part
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, central_square
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.modulator.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.aperture import check_aperture
 from kornia_tidy.optics.lens.lens import Lens
@@ -45,7 +46,6 @@ from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.psf.wide_blur import SMALLEST_WIDE_RADIUS, BlurGroup, WideBlur, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 Points = tuple[tuple[float, float], ...]
 AXIS: Points = ((0.0, 0.0),)

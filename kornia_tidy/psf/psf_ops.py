@@ -14,12 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.mode import recording_in_operator
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import BankMemory
 from kornia_tidy.psf.pupil import Pupil
-from kornia_tidy.runtime.mode import recording_in_operator
 
 _LENS = (
     "Tensor phase, Tensor weights, Tensor amplitude, float cell_pitch, float fill_factor, float light,"

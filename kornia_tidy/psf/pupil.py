@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kornia_tidy.kernels.precision import has_float64
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture, light_through
-from kornia_tidy.runtime.precision import has_float64
 
 
 @dataclass(frozen=True, eq=False)

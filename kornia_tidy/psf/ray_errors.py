@@ -16,10 +16,10 @@ import math
 import torch
 from torch import Tensor
 
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.lens_psfs import TurnedLens
-from kornia_tidy.runtime.default_device import on_cpu
 
 _STEP = 1e-4  # of differences over the stop, in its radii
 

@@ -1,26 +1,35 @@
-"""Reconstruction of the all-in-focus image and of depth from captures: networks, inversion, losses, metrics.
+"""Reconstruction of the all-in-focus image and of depth from captures: networks, inversion, trained systems, metrics.
 
-Captures come in, maps of the same size go out. Read ``head.py``, the base class of the networks, first.
+Captures come in, maps of the same size go out. Read ``head.py``, the base class of the networks, first; ``trained.py``
+joins a camera with learnt masks and the network that reads its captures, and ``pretrained/`` has the systems that are
+shipped. The names below are imported when they are first asked for: settings are read without torch.
 """
 
-from kornia_tidy.reconstruction.attention_unet import AttentionUNet
-from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, closed_form_channels
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
-from kornia_tidy.reconstruction.head import ReconstructionHead
-from kornia_tidy.reconstruction.joint import JointEstimate, JointHead, UncertainJointEstimate
-from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
-from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
-from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
-from kornia_tidy.reconstruction.nafnet import NAFNet
-from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
-from kornia_tidy.reconstruction.receptive_field import receptive_field
-from kornia_tidy.reconstruction.refocused import Refocused
-from kornia_tidy.reconstruction.residual import Residual
-from kornia_tidy.reconstruction.restored_over_field import restored_over_field
-from kornia_tidy.reconstruction.self_ensemble import SelfEnsemble, self_ensemble
-from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
-from kornia_tidy.reconstruction.tiled import reconstruct_tiled
-from kornia_tidy.reconstruction.wiener import Wiener
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from kornia_tidy.lazy import importer
+
+if TYPE_CHECKING:
+    from kornia_tidy.reconstruction.attention_unet import AttentionUNet
+    from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, closed_form_channels
+    from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+    from kornia_tidy.reconstruction.head import ReconstructionHead
+    from kornia_tidy.reconstruction.joint import JointEstimate, JointHead, UncertainJointEstimate
+    from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
+    from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
+    from kornia_tidy.reconstruction.midas_small import MiDaSSmall, load_midas_small
+    from kornia_tidy.reconstruction.nafnet import NAFNet
+    from kornia_tidy.reconstruction.phasecam3d_unet import PhaseCam3DUNet
+    from kornia_tidy.reconstruction.receptive_field import receptive_field
+    from kornia_tidy.reconstruction.refocused import Refocused
+    from kornia_tidy.reconstruction.residual import Residual
+    from kornia_tidy.reconstruction.restored_over_field import restored_over_field
+    from kornia_tidy.reconstruction.self_ensemble import SelfEnsemble, self_ensemble
+    from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
+    from kornia_tidy.reconstruction.tiled import reconstruct_tiled
+    from kornia_tidy.reconstruction.wiener import Wiener
 
 __all__ = [
     "AttentionUNet",
@@ -50,3 +59,45 @@ __all__ = [
     "restored_over_field",
     "self_ensemble",
 ]
+
+__getattr__ = importer(
+    __name__,
+    {
+        "attention_unet": ("AttentionUNet",),
+        "closed_form": (
+            "ClosedForm",
+            "Restoration",
+            "closed_form_channels",
+        ),
+        "closed_form_head": ("ClosedFormHead",),
+        "head": ("ReconstructionHead",),
+        "joint": (
+            "JointEstimate",
+            "JointHead",
+            "UncertainJointEstimate",
+        ),
+        "joint_closed_form": ("JointClosedFormHead",),
+        "layered_joint": ("LayeredJointHead",),
+        "midas_small": (
+            "MiDaSSmall",
+            "load_midas_small",
+        ),
+        "nafnet": ("NAFNet",),
+        "phasecam3d_unet": ("PhaseCam3DUNet",),
+        "receptive_field": ("receptive_field",),
+        "refocused": ("Refocused",),
+        "residual": ("Residual",),
+        "restored_over_field": ("restored_over_field",),
+        "self_ensemble": (
+            "SelfEnsemble",
+            "self_ensemble",
+        ),
+        "tikhonov": (
+            "Preconditioned",
+            "Tikhonov",
+            "TikhonovLayers",
+        ),
+        "tiled": ("reconstruct_tiled",),
+        "wiener": ("Wiener",),
+    },
+)

@@ -45,7 +45,7 @@ class ClosedFormHead(ReconstructionHead):
     Convention:
         - PSFs and noise come from the camera by :meth:`~kornia_tidy.reconstruction.closed_form.ClosedForm.set_psfs`
           and :meth:`~kornia_tidy.reconstruction.closed_form.ClosedForm.set_noise` of ``closed_form``, or both by
-          :func:`kornia_tidy.inference.trained.update_psfs`. They are part of the state.
+          :func:`kornia_tidy.reconstruction.trained.update_psfs`. They are part of the state.
         - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the deconvolution.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes a closed form. He et

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import check_head_image, layout_remedy
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 
 class ReconstructionHead(nn.Module, ABC):

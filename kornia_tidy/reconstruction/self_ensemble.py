@@ -87,7 +87,7 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
 
     Example:
         >>> import torch
-        >>> from kornia_tidy.inference.pretrained import load_pretrained
+        >>> from kornia_tidy.reconstruction.pretrained import load_pretrained
         >>> system = load_pretrained("edof-5")
         >>> with torch.inference_mode():
         ...     image = self_ensemble(system.head, 2)(torch.rand(1, 3, 64, 64))

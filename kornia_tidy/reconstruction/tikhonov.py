@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_positive, printed
+from kornia_tidy.kernels.precision import widest
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.runtime.precision import widest
 
 BORDERS = ("smooth", "circular")
 

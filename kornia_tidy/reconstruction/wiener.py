@@ -12,11 +12,11 @@ from torch import Tensor
 from torch.nn import functional
 
 from kornia_tidy.checks import check_choice, check_float_tensor, check_number, check_part
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.reconstruction.tikhonov import BORDERS, Inversion, transfer_function
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.sensor.noise import SensorNoise
 
 
@@ -36,7 +36,7 @@ def wiener(
 
     H is the transfer function, :math:`\langle\rangle` the mean over depth, and S the power spectrum of scenes. Where
     PSFs differ between depths, :math:`\langle |H|^2 \rangle` exceeds :math:`|\langle H \rangle|^2`, and the filter
-    amplifies less. Its error is :func:`kornia_tidy.mask_design.restoration_error`.
+    amplifies less. Its error is :func:`kornia_tidy.design.restoration_error`.
 
     Args:
         capture: y, (B, C, H, W) linear light.

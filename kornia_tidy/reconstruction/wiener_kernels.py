@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.reconstruction.tikhonov_kernels import MARGIN, centred_window
 from kornia_tidy.reconstruction.wiener import inverse_spectrum
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS, SceneStatistics
 
 
 def wiener_kernels(psfs: Tensor, noises: tuple[float, ...], statistics: SceneStatistics = PHOTOGRAPHS) -> Tensor:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.render.backend import Backend, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.scene import LayeredScene
-from kornia_tidy.runtime.mode import Mode, torch_mode
 
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DenseBackend(), CompiledBackend(), BatchedBackend())

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
-from kornia_tidy.runtime.mode import Mode, torch_mode
+from kornia_tidy.mode import Mode, torch_mode
 
 LAYER_MODES = ("nearest", "linear")
 

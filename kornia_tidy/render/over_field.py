@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kornia_tidy.mode import torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_cache import nodes_around
@@ -28,7 +29,6 @@ from kornia_tidy.render.borders import check_border, cropped, from_spectrum, pad
 from kornia_tidy.render.layers import assign_layers, present_layers, weight_of_layer
 from kornia_tidy.render.render_ops import Rendering, render_layers
 from kornia_tidy.render.stray_light import spread_evenly
-from kornia_tidy.runtime.mode import torch_mode
 
 
 def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> Tensor:

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.mode import Mode, recording_in_operator, torch_mode
 from kornia_tidy.render.backends.dense import differentiable_gradients
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import check_nodes
 from kornia_tidy.render.scene import assigned_scene, check_scene
 from kornia_tidy.render.stray_light import stray_light_of
-from kornia_tidy.runtime.mode import Mode, recording_in_operator, torch_mode
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.precision import has_float64
 from kornia_tidy.render.layers import blend_of_layers
 from kornia_tidy.render.scene import LayeredScene
-from kornia_tidy.runtime.precision import has_float64
 
 _RINGS = 128  # at most; in larger images neighbours stand together, each group's light spread evenly over its pixels
 

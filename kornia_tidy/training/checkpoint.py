@@ -8,7 +8,7 @@ from typing import Any
 
 from lightning.fabric.plugins import CheckpointIO
 
-from kornia_tidy.inference.state_file import read_state, write_state
+from kornia_tidy.reconstruction.state_file import read_state, write_state
 
 
 class SafetensorsIO(CheckpointIO):
@@ -20,7 +20,7 @@ class SafetensorsIO(CheckpointIO):
         path: str | os.PathLike[str],
         storage_options: Any | None = None,
     ) -> None:
-        """Write a checkpoint as :func:`~kornia_tidy.inference.state_file.write_state` does."""
+        """Write a checkpoint as :func:`~kornia_tidy.reconstruction.state_file.write_state` does."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         write_state(path, checkpoint)
 
@@ -30,7 +30,7 @@ class SafetensorsIO(CheckpointIO):
         map_location: Any | None = None,
         weights_only: bool | None = None,
     ) -> dict[str, Any]:
-        """Read a checkpoint to the CPU as :func:`~kornia_tidy.inference.state_file.read_state` does."""
+        """Read a checkpoint to the CPU as :func:`~kornia_tidy.reconstruction.state_file.read_state` does."""
         return read_state(path)
 
     def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:

@@ -19,8 +19,8 @@ from kornia_tidy.data.photo_collages import PhotoCollages, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.remembered import Remembered
 from kornia_tidy.data.rgbd_folder import described_folder
-from kornia_tidy.inference.tasks import metres
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.settings import TrainingSettings

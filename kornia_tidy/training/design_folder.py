@@ -7,9 +7,9 @@ import os
 from pathlib import Path
 from typing import Any
 
+from kornia_tidy.design.candidates import FLAT
+from kornia_tidy.design.design_report import CAMERA, DATA
 from kornia_tidy.files import read_json
-from kornia_tidy.mask_design.candidates import FLAT
-from kornia_tidy.mask_design.design_report import CAMERA, DATA
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.psf.camera_settings import settings_of
 

@@ -6,8 +6,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.mask_design.objectives import design, restoration_error
-from kornia_tidy.scene_statistics.statistics import PHOTOGRAPHS
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
+from kornia_tidy.design.objectives import design, restoration_error
 
 LEAST_SIGMA = 1e-3  # in units of full scale; without noise every blur can be inverted
 SCENE_SPREAD = PHOTOGRAPHS.spread
@@ -30,7 +30,7 @@ def design_masks(lens: TiDyOptics, steps: int, sigma: float = 0.01, *, progress:
         progress: show a progress bar.
 
     Returns:
-        The :func:`~kornia_tidy.mask_design.objectives.restoration_error` before each step, averaged over colours,
+        The :func:`~kornia_tidy.design.objectives.restoration_error` before each step, averaged over colours,
         with the largest window that the fidelity allows.
 
     Raises:

@@ -17,12 +17,12 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.tasks import centre_crop, depth_logits, metres, normalised_inverse_depth, split_maps
-from kornia_tidy.inference.trained import TrainedSystem
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores, rmse
 from kornia_tidy.reconstruction.reliability import sparsification_curve
+from kornia_tidy.reconstruction.tasks import centre_crop, depth_logits, metres, normalised_inverse_depth, split_maps
+from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.training.pictures import error_map
 from kornia_tidy.training.scenes import Broken, SceneLoader
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kornia_tidy.runtime.search_path import import_installed
+from kornia_tidy.search_path import import_installed
 
 
 def require_lightning() -> None:

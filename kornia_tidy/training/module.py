@@ -14,16 +14,6 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.inference.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
-from kornia_tidy.inference.trained import (
-    build_head,
-    build_optics,
-    check_weights,
-    describe,
-    fix_window,
-    psfs_to_store,
-    update_psfs,
-)
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
@@ -32,6 +22,16 @@ from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
+from kornia_tidy.reconstruction.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
+from kornia_tidy.reconstruction.trained import (
+    build_head,
+    build_optics,
+    check_weights,
+    describe,
+    fix_window,
+    psfs_to_store,
+    update_psfs,
+)
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.sensor.noise import SensorNoise
 from kornia_tidy.training.average import MovingAverage
@@ -97,7 +97,7 @@ class TidyTraining(pl.LightningModule):
             D + 3 with a distribution of depth over D classes, which is then trained by
             :func:`~kornia_tidy.reconstruction.depth_distribution.distribution_loss`.
         task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
-            :func:`~kornia_tidy.inference.tasks.normalised_inverse_depth`.
+            :func:`~kornia_tidy.reconstruction.tasks.normalised_inverse_depth`.
         loss: function of an estimated map, the true map and the validity mask; the same for all maps.
         lr: learning rate of the network, and of learnable parameters of the optics other than masks.
         lr_metres: learning rate of the masks, in metres of height.

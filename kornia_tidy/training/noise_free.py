@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.files import read_bytes, read_json, write_bytes
-from kornia_tidy.inference.tasks import normalised_inverse_depth
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.render.repeatable import repeatable
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded

@@ -14,7 +14,7 @@ EVALUATION, VALIDATION = "evaluation/summary.json", "validation.csv"
 
 
 def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    r"""Read the record of a run for its model card, see :func:`kornia_tidy.inference.hub.save_pretrained`.
+    r"""Read the record of a run for its model card, see :func:`kornia_tidy.reconstruction.hub.save_pretrained`.
 
     Args:
         folder: of the run. ``evaluation/summary.json`` in it, which ``kornia-tidy evaluate`` writes, has the scores on

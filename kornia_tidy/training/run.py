@@ -21,9 +21,13 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.saved_camera import below
 from kornia_tidy.files import only_here
-from kornia_tidy.inference.head_names import CLOSED_FORMS
-from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.inference.trained import (
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
+from kornia_tidy.reconstruction.nafnet import deepened
+from kornia_tidy.reconstruction.state_file import read_state
+from kornia_tidy.reconstruction.trained import (
     fix_window,
     head_prefix,
     load_masks,
@@ -31,10 +35,6 @@ from kornia_tidy.inference.trained import (
     stored_psfs,
     weights_of,
 )
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
-from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead, as_refiner, widened_for_depth
-from kornia_tidy.reconstruction.nafnet import deepened
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.callbacks import LAST, DrawPictures, SaveCheckpoints, WriteLog
 from kornia_tidy.training.checkpoint import SafetensorsIO
@@ -80,7 +80,7 @@ def train(
         refiner_from: checkpoint with a network for the image, with whose weights the refiner of ``refined`` begins.
         masks_from: checkpoint with the initial masks, such as those of a shipped system, or the state of a camera, such
             as ``camera.safetensors`` of ``kornia-tidy design``.
-        psfs: measured ones, for settings of :func:`~kornia_tidy.inference.measured.measured_settings`. A run that
+        psfs: measured ones, for settings of :func:`~kornia_tidy.lab.measured.measured_settings`. A run that
             resumes has them in its checkpoint.
         captures: folder of the noise-free captures, for fixed optics. Runs with the same camera and scenes may
             share it. Default: ``captures/`` in the folder of the run.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, default_collate
 
-from kornia_tidy.runtime.search_path import starting_workers
+from kornia_tidy.search_path import starting_workers
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.random_state import seeded
 

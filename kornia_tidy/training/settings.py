@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from kornia_tidy.inference.head_names import CLOSED_FORMS, FIXED
-from kornia_tidy.inference.settings import SystemSettings
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS, FIXED
+from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.settings import Count, CountOrNone, Factor, FNumber, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
-    from kornia_tidy.inference.trained import TrainedSystem
+    from kornia_tidy.reconstruction.trained import TrainedSystem
 
 DATA = {
     "photographic-leaves": "painted, like photographs",

@@ -31,8 +31,8 @@ def check_stored_run(state: Mapping[str, Any], trainer: pl.Trainer, module: Tidy
     """Raise ``ValueError`` unless a run can go on from a state with nothing lost.
 
     Args:
-        state: as :func:`~kornia_tidy.inference.state_file.read_state` returns it. Its weights are compared elsewhere,
-            when they are loaded.
+        state: as :func:`~kornia_tidy.reconstruction.state_file.read_state` returns it. Its weights are compared
+            elsewhere, when they are loaded.
         trainer: of the run, before it is fitted.
         module: of the run.
         batches: of an epoch.

@@ -11,8 +11,8 @@ import kornia_tidy
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
 from kornia_tidy.data import read_rgbd
-from kornia_tidy.inference.light_head import LightHead, reconstruct_opencv
-from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_opencv
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from tests.base import BaseTester
 
 MOST = {"uint8": 255, "uint16": 65535, "float32": 1}

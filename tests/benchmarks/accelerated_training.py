@@ -35,14 +35,14 @@ from tqdm.auto import tqdm
 from kornia_tidy.data import photo_collages
 from kornia_tidy.data.photo_collages import photo_collage, photographs_in
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.pretrained import FOLDER
-from kornia_tidy.inference.state_file import write_state
-from kornia_tidy.inference.tasks import metres
-from kornia_tidy.inference.trained import build_head, describe, load_trained, update_psfs
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction import closed_form
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.metrics import SSIM_WINDOW, psnr
+from kornia_tidy.reconstruction.pretrained import FOLDER
+from kornia_tidy.reconstruction.state_file import write_state
+from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.reconstruction.trained import build_head, describe, load_trained, update_psfs
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.training.callbacks import BEST

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from kornia_tidy.tradeoff.costs import synchronize
+from kornia_tidy.design.tradeoff.costs import synchronize
 
 SIZE_VARIABLE = "KORNIA_TIDY_BENCH_SIZE"
 

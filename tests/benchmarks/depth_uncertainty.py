@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from kornia_tidy.inference.tasks import depth_logits
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.reliability import reliability_curve, sparsification_curve
+from kornia_tidy.reconstruction.tasks import depth_logits
 from tests.benchmarks.results.captures import FIXED, capture, irradiance
 from tests.benchmarks.results.restorations import takes_noise
 from tests.benchmarks.results.scenes import BenchScene, real_scenes

@@ -23,8 +23,8 @@ import numpy as np
 import rawpy
 import torch
 
-from kornia_tidy.raw.capture import RawCapture
-from kornia_tidy.raw.develop import develop
+from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw.develop import develop
 from tests.base import DATA
 
 LARGEST = DATA / "raw/imageio+test_images/Blackmagic.dng"

@@ -34,9 +34,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.trained import build_optics
 from kornia_tidy.optics import camera_spectrum
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.trained import build_optics
 from kornia_tidy.render.compositing import render
 from kornia_tidy.training.settings import TrainingSettings
 from tests.benchmarks.capabilities import by_depth_interpolation

@@ -25,11 +25,11 @@ from unittest import mock
 
 import torch
 
+from kornia_tidy.design.tradeoff.conditions import device_name
 from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.render.backends import compiled
 from kornia_tidy.render.dispatch import BACKENDS, choose, refusal
 from kornia_tidy.render.scene import LayeredScene, layered_scene
-from kornia_tidy.tradeoff.conditions import device_name
 
 GOOD, BAD = 1.15, 2.0
 WINDOWS, LAYERS, SIDES = (5, 9, 15, 23, 33, 41, 65, 97, 129), (1, 3, 8, 21), (256, 512, 1024, 2048)

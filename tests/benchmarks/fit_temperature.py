@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.tasks import depth_logits
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
+from kornia_tidy.reconstruction.state_file import read_state, write_state
+from kornia_tidy.reconstruction.tasks import depth_logits
 from kornia_tidy.training.callbacks import BEST
 from tests.benchmarks.results.captures import FIXED, capture, irradiance
 from tests.benchmarks.results.scenes import real_scenes

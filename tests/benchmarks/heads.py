@@ -32,11 +32,11 @@ from kornia_tidy.choices import STARTS
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.pretrained import FOLDER, ship
-from kornia_tidy.inference.tasks import stretched
-from kornia_tidy.inference.trained import load_trained
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
+from kornia_tidy.reconstruction.pretrained import FOLDER, ship
+from kornia_tidy.reconstruction.tasks import stretched
+from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.callbacks import BEST
 from kornia_tidy.training.evaluation import SceneResult, evaluate, mean_row
 from kornia_tidy.training.run import train

@@ -26,11 +26,6 @@ from tqdm import tqdm
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.figures.reliability import Reliability, draw_reliability
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.state_file import write_state
-from kornia_tidy.inference.tasks import depth_logits, normalised_inverse_depth
-from kornia_tidy.inference.trained import build_head, load_trained, update_psfs
 from kornia_tidy.reconstruction.depth_distribution import (
     depth_moments,
     distribution_loss,
@@ -42,7 +37,12 @@ from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.reliability import reliability_curve, sparsification_curve
+from kornia_tidy.reconstruction.settings import SystemSettings
+from kornia_tidy.reconstruction.state_file import write_state
+from kornia_tidy.reconstruction.tasks import depth_logits, normalised_inverse_depth
+from kornia_tidy.reconstruction.trained import build_head, load_trained, update_psfs
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.module import cosine_rate
 from tests.benchmarks.heads import RealScenes

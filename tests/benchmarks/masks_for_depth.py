@@ -2,7 +2,7 @@
 
 For each of three seeds, one mask and five are designed with the aperture and the focus, for depth alone or for the
 image, too (``--depth-weight``), by the same numbers of candidates and gradient steps:
-:func:`kornia_tidy.mask_design.co_design` at 57,000 electrons. Scenes are
+:func:`kornia_tidy.design.co_design` at 57,000 electrons. Scenes are
 those of :mod:`tests.benchmarks.when_coding_pays`: half A chooses the finalist and its settings, half B scores it. Each
 design is kept in FOLDER as ``kornia-tidy design`` writes it; the same command goes on where it stopped.
 """
@@ -17,11 +17,11 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from kornia_tidy.design.candidates import Candidate, search_lens
+from kornia_tidy.design.co_design import CoDesign, Effort, co_design, planned_work
+from kornia_tidy.design.design_report import design_files
+from kornia_tidy.design.design_task import DesignTask, mask_of
 from kornia_tidy.files import write_bytes
-from kornia_tidy.mask_design.candidates import Candidate, search_lens
-from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design, planned_work
-from kornia_tidy.mask_design.design_report import design_files
-from kornia_tidy.mask_design.design_task import DesignTask, mask_of
 from tests.benchmarks.standard_error import mean_and_error
 from tests.benchmarks.when_coding_pays import scenes_for
 

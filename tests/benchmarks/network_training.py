@@ -25,10 +25,10 @@ from torch import Tensor
 
 from kornia_tidy import SensorNoise
 from kornia_tidy.data.patches import central_crop
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.tasks import stretched
-from kornia_tidy.inference.trained import build_head, build_optics
 from kornia_tidy.reconstruction.metrics import psnr
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.tasks import stretched
+from kornia_tidy.reconstruction.trained import build_head, build_optics
 from kornia_tidy.training.data_sets import make_scenes
 from kornia_tidy.training.module import TidyTraining, cosine_rate
 from kornia_tidy.training.noise_free import NoiseFreeCaptures

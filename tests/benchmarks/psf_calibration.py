@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from kornia_tidy.calibration.psf import MeasuredPSFs, diffraction_cutoff, measure_psfs, point_images
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.inference.pretrained import load_pretrained
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs, diffraction_cutoff, measure_psfs, point_images
 from kornia_tidy.masks import PhaseMasks, PixelwiseMask
 from kornia_tidy.masks.initial_heights import fisher_mask
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tikhonov import tikhonov
 from kornia_tidy.sensor.noise import SensorNoise
-from tests.calibration.psf.captures import exposed, on_pixels, planes, point_light
+from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
 
 CAMERA, SPECTRUM = ThinLensCamera(), Spectrum.rgb()
 CUTOFF = [diffraction_cutoff(CAMERA, wavelength) for wavelength in SPECTRUM.wavelengths]

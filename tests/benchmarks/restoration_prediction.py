@@ -28,15 +28,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.mask_design.objectives import restoration_error
+from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.design.objectives import restoration_error
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
+from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.wiener import TransferMoments, inverse_spectrum, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.sensor import exposed_sensor
 from tests.benchmarks.heads import RealScenes
 from tests.scenes import halves

@@ -32,8 +32,8 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.photo_collages import PhotoCollages, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves
 from kornia_tidy.data.scene_dataset import SceneDataset
-from kornia_tidy.inference.tasks import normalised_inverse_depth
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from tests.benchmarks.results.scenes import real_scenes
 from tests.scenes import ENTRIES, load_scene
 

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, about_pretrained, ship
+from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, about_pretrained, ship
 from kornia_tidy.training.callbacks import BEST
 from kornia_tidy.training.settings import TrainingSettings
 from tests.benchmarks.heads import score

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.mask_design import autocorrelation_bound
+from kornia_tidy.design import autocorrelation_bound
 from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, SpatialLightModulator, Switching
 from kornia_tidy.optics import camera_spectrum, circular_aperture, polygon_aperture

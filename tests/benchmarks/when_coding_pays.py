@@ -5,7 +5,7 @@
 - ``... table FILE.json``: prints the table as Markdown.
 - ``... plot FILE.json PICTURE.png``: draws the map.
 
-Each cell is a :func:`kornia_tidy.mask_design.co_design`, seed 0. Scenes are real ones of ../shared/data, twelve of each
+Each cell is a :func:`kornia_tidy.design.co_design`, seed 0. Scenes are real ones of ../shared/data, twelve of each
 half: the middle 256 pixels, depth stretched over the range in dioptres. Half A chooses settings and finalists, half B
 scores.
 """
@@ -24,11 +24,11 @@ from tqdm import tqdm
 
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.data.rgbd import Scene
+from kornia_tidy.design.co_design import CoDesign, Effort, co_design
+from kornia_tidy.design.design_task import DesignTask
 from kornia_tidy.figures.style import ACCENT, FAINT, INK, open_chart
 from kornia_tidy.files import read_json, write_bytes
-from kornia_tidy.inference.tasks import stretched
-from kornia_tidy.mask_design.co_design import CoDesign, Effort, co_design
-from kornia_tidy.mask_design.design_task import DesignTask
+from kornia_tidy.reconstruction.tasks import stretched
 from tests.scenes import ENTRIES, halves, load_scene
 
 LIGHTS = (57_000, 10_000, 2_000, 500)  # electrons of white at f/17.6

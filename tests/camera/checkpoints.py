@@ -30,15 +30,14 @@ from kornia_tidy import (
     ThinLensCamera,
     TiDyOptics,
 )
-from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.state_file import write_state
-from kornia_tidy.inference.trained import build_head, build_optics, load_trained
 from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, StrokeError
-from kornia_tidy.optics import FUSED_SILICA, PDMS, annular_aperture, camera_spectrum, polygon_aperture
+from kornia_tidy.optics import FUSED_SILICA, PDMS, SYSTEMS, annular_aperture, camera_spectrum, polygon_aperture
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.settings import SystemSettings
+from kornia_tidy.reconstruction.state_file import write_state
+from kornia_tidy.reconstruction.trained import build_head, build_optics, load_trained
 
 FOLDER = Path(__file__).parent / "checkpoints"
 SIDE = 32  # pixels of the scene

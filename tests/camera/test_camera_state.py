@@ -15,16 +15,15 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
-from kornia_tidy.inference.state_file import read_state, write_state
 from kornia_tidy.masks import CubicMask, RadialMask
 from kornia_tidy.modulator.modulator import LearnableDwellTimes, SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.modulator.switching import Switching
-from kornia_tidy.optics import FUSED_SILICA
+from kornia_tidy.optics import FUSED_SILICA, SYSTEMS
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
 

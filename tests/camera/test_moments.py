@@ -16,7 +16,7 @@ from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moment_times, moving_capture, state_times
 from kornia_tidy.modulator.modulator import DiffractionEfficiency, Modulator, SpatialLightModulator, timeline_of
 from kornia_tidy.modulator.phase_panel import GreyLevels, PixelCrosstalk, StrokeError
-from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.optics import SYSTEMS
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0, stray_light="discard", double=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kornia_tidy.data.metadata import with_exif, with_text
-from kornia_tidy.raw.tags import camera_tags
+from kornia_tidy.lab.raw.tags import camera_tags
 from tests.base import BaseTester
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from kornia_tidy.design import Candidate, CoDesign, DesignTask, Finalist, Verdict
+from kornia_tidy.design.candidates import FLAT
 from kornia_tidy.figures.co_design import draw_co_design
-from kornia_tidy.mask_design import Candidate, CoDesign, DesignTask, Finalist, Verdict
-from kornia_tidy.mask_design.candidates import FLAT
 from tests.base import BaseTester
 
 FLAT_50 = Candidate(FLAT, 50.0, 0.5, 0.0210, math.nan, -16.8, None)

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from kornia_tidy import PSFBank
-from kornia_tidy.calibration.psf import MeasuredPSFs, PointReport
-from kornia_tidy.calibration.psf.phase_retrieval import MaskFit
 from kornia_tidy.figures.measured_psfs import draw_measured
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
+from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 

@@ -6,7 +6,7 @@ import torch
 from kornia_tidy import DefocusRange, TiDyOptics
 from kornia_tidy.figures.system_statistics import system_statistics
 from kornia_tidy.figures.systems import Portrait, draw_systems
-from kornia_tidy.systems import published_system
+from kornia_tidy.optics import published_system
 from tests.base import BaseTester
 
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from kornia_tidy.calibration.noise.photon_transfer import PhotonTransfer, TransferLine
-from kornia_tidy.calibration.noise.transfer_curve import CurvePoint
 from kornia_tidy.figures.transfer import draw_transfer
+from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine
+from kornia_tidy.lab.calibration.noise.transfer_curve import CurvePoint
 from tests.base import BaseTester
 
 LINE = TransferLine(2.0, 0.01, 6.0, 0.1, 0.01, 0.999, 10000)

@@ -18,19 +18,19 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.coded_datasets import CodedCaptures
 from kornia_tidy.data import NYUDepthV2, read_depth, read_image
 from kornia_tidy.data.calibration_files import read_calibration
-from kornia_tidy.inference.state_file import read_state
-from kornia_tidy.mask_export import read_heights
-from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.lab.mask_export import read_heights
+from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.reconstruction.midas_small import load_midas_small
+from kornia_tidy.reconstruction.state_file import read_state
+from kornia_tidy.training.coded_datasets import CodedCaptures
 from tests.base import BaseTester
 from tests.data.published import write_nyu
 from tests.data.tiff_writer import Page, tiff
 from tests.forks import fork, wait
 from tests.hostile.limited import limit_memory
-from tests.raw.dng import dng
+from tests.lab.raw.dng import dng
 
 ROOM = 160 << 20  # bytes
 HUGE = 10**6

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from kornia_tidy.data import NYUDepthV2, read_depth
-from kornia_tidy.mask_export import read_slm_frames
+from kornia_tidy.lab.mask_export import read_slm_frames
 from kornia_tidy.training.callbacks import drop_rows_after
 from tests.base import BaseTester
 from tests.data.published import write_nyu

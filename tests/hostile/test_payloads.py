@@ -12,7 +12,7 @@ import pytest
 
 from kornia_tidy import cli
 from kornia_tidy.data import read_depth, read_image
-from kornia_tidy.raw.capture import RawCapture
+from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.reconstruction.midas_small import load_midas_small
 from tests.base import BaseTester
 from tests.hostile.payloads import MARKER, payloads

@@ -15,11 +15,11 @@ from kornia_tidy import PixelwiseMask
 from kornia_tidy.data import read_image, write_depth, write_image
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.files import write_bytes, write_folder
-from kornia_tidy.mask_export import write_heights
+from kornia_tidy.lab.mask_export import write_heights
 from tests.base import BaseTester
 from tests.forks import fork, wait
 from tests.hostile.limited import apart, command, drop_rights, limit_files
-from tests.raw.dng import dng
+from tests.lab.raw.dng import dng
 
 NAMES = (
     "with blanks  in it.png", "Übermaß 图像 🎉.png", "e\u0301.png", "a\nb\tc.png", "a'b\"c$(d)*?[e].png",

@@ -1,7 +1,7 @@
 """Ctrl-C and SIGTERM in the middle of commands: exit status, nothing half written, and a state that goes on.
 
 Nothing waits for a moment on the clock: a fork sends the signal to itself after a random time of its own on the
-processor. SIGKILL is in tests/coded_datasets/test_resume.py and tests/training/test_resume.py.
+processor. SIGKILL is in tests/training/coded_datasets/test_resume.py and tests/training/test_resume.py.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import torch
 
 from kornia_tidy import cli
 from kornia_tidy.files import replacing
-from kornia_tidy.runtime.signals import is_command
+from kornia_tidy.signals import is_command
 from tests.base import BaseTester
-from tests.coded_datasets.samples import contents
 from tests.forks import fork, wait
 from tests.hostile.limited import apart, command
+from tests.training.coded_datasets.samples import contents
 
 RENDER = ("render", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--masks", "1", "--fidelity", "draft")
 TRAIN = ("train", "--resume", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--validation-scenes", "2",

@@ -172,8 +172,6 @@ class TestThreads(WheelTester):
             "torch = sys.modules['torch'] = types.ModuleType('torch'); torch.float32 = 'f'; torch.float64 = 'd'\n"
             "torch.dtype = str; package = sys.modules['kornia_tidy'] = types.ModuleType('kornia_tidy')\n"
             f"package.__path__ = [{str(ROOT / 'kornia_tidy')!r}]\n"
-            "package = sys.modules['kornia_tidy.runtime'] = types.ModuleType('kornia_tidy.runtime')\n"
-            f"package.__path__ = [{str(ROOT / 'kornia_tidy' / 'runtime')!r}]\n"
             "assert not hasattr(ctypes.CDLL(None), 'GOMP_parallel')\n"
             "from kornia_tidy.kernels.build import build\n"
             f"built = build(Path({str(library.parent.parent / 'twice.c')!r}), 'd')\n"

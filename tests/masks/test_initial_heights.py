@@ -5,7 +5,7 @@ import torch
 
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.choices import STARTS
-from kornia_tidy.mask_design.objectives import design_fisher_mask
+from kornia_tidy.design.objectives import design_fisher_mask
 from kornia_tidy.masks.initial_heights import CLEAN, SMALL_NOISE, SWEEP, fisher_mask, initial_heights
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester

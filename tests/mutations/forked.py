@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from safetensors import safe_open
 
-from kornia_tidy import cli
+from kornia_tidy.cli import command_line
 from tests.mutations.pristine import Case
 
 SECONDS = 60.0
@@ -102,7 +102,7 @@ def _note_kind(told: Callable[[Exception], int]) -> Callable[[Exception], int]:
     """Record the type of each error that becomes a message; damaged content may only raise the allowed types."""
 
     def note(error: Exception) -> int:
-        if not isinstance(error, (OSError, ValueError)) and not cli._is_out_of_memory(error):
+        if not isinstance(error, (OSError, ValueError)) and not command_line._is_out_of_memory(error):
             Path(UNFORESEEN).write_text(type(error).__name__)
         return told(error)
 
@@ -110,7 +110,7 @@ def _note_kind(told: Callable[[Exception], int]) -> Callable[[Exception], int]:
 
 
 def _command(case: Case, path: Path) -> int:
-    cli._told = _note_kind(cli._told)
+    command_line._told = _note_kind(command_line._told)
     if callable(case.command):
         try:
             case.command(path)
@@ -118,7 +118,7 @@ def _command(case: Case, path: Path) -> int:
             print(f"kornia-tidy: error: {' '.join(str(error).split())}", file=sys.stderr)
             return REFUSED
         return 0
-    return cli.main(
+    return command_line.main(
         [str(path) if word == "IN" else str(path.parent) if word == "FOLDER" else word for word in case.command]
     )
 

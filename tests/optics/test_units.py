@@ -35,14 +35,14 @@ from kornia_tidy.cli import main
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.data.depth_files import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
-from kornia_tidy.inference.trained import check_weights
 from kornia_tidy.masks import ZernikeMask
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
 from kornia_tidy.modulator.switching import Switching
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import PhaseCam3DUNet
-from kornia_tidy.systems import SYSTEMS
+from kornia_tidy.reconstruction.trained import check_weights
 from tests.base import BaseTester, shared
 from tests.scenes import ENTRIES, load_scene
 

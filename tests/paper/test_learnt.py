@@ -18,9 +18,9 @@ from examples.paper.scenes import BUDGETS, ForCamera, painted
 from examples.paper.sequence_length import EXPERIMENT, first_masks
 from examples.paper.training import closed_form_system, constant_depth, mean_scores, train
 from kornia_tidy import FresnelLens, PixelwiseMask, ThinLensCamera
-from kornia_tidy.inference.pretrained import PRETRAINED
-from kornia_tidy.inference.tasks import normalised_inverse_depth
-from kornia_tidy.systems.presets import SYSTEMS
+from kornia_tidy.optics.published_systems import SYSTEMS
+from kornia_tidy.reconstruction.pretrained import PRETRAINED
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")

@@ -14,7 +14,7 @@ from examples.paper.runner import ABOUT, main, run
 from examples.paper.shipped import with_parts
 from examples.paper.switching_time import trials as switching_trials
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.mask_design.non_convexity import autocorrelation_bound, extreme_points
+from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.optics.aperture import circular_aperture
 from tests.base import BaseTester
 

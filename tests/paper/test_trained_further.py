@@ -13,8 +13,8 @@ from examples.paper.scenes import BUDGETS
 from examples.paper.sequence_length import first_masks
 from examples.paper.training import fit, head_settings, mean_scores
 from kornia_tidy import DwellTimes, Switching
-from kornia_tidy.inference.pretrained import load_pretrained
-from kornia_tidy.inference.trained import build_head
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.trained import build_head
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")

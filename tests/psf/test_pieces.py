@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.design.tradeoff.costs import peak_bytes
 from kornia_tidy.psf import exact, pieces
 from kornia_tidy.psf.pieces import Piece, comes_in_pieces, layer_bytes, pieces_of, runs_of
 from kornia_tidy.render.exposure import render_pieces
-from kornia_tidy.tradeoff.costs import peak_bytes
 from tests.base import BaseTester
 
 # Layer weights carry a rounding of defocus over the layers' spacing, 1e2 units of the last place; PSFs and transforms

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
     AttentionUNet,
@@ -17,6 +16,7 @@ from kornia_tidy.reconstruction import (
     reconstruct_tiled,
 )
 from kornia_tidy.reconstruction.closed_form_head import with_fine_maps
+from kornia_tidy.reconstruction.heads import PlainHead
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo

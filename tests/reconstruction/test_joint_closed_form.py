@@ -7,9 +7,6 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch.nn import functional
 
-from kornia_tidy.inference.heads import PlainHead
-from kornia_tidy.inference.settings import SystemSettings
-from kornia_tidy.inference.trained import build_head
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
     ClosedFormHead,
@@ -36,9 +33,12 @@ from kornia_tidy.reconstruction.closed_form import (
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.guided_classes import smoothed_classes
+from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.joint_closed_form import as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
+from kornia_tidy.reconstruction.trained import build_head
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo

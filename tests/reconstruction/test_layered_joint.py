@@ -7,7 +7,6 @@ import torch
 from kornia.color import linear_rgb_to_rgb
 from torch import nn
 
-from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
     JointHead,
@@ -19,6 +18,7 @@ from kornia_tidy.reconstruction import (
 )
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, soft_targets
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood
+from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.layered_joint import LEAST, SHARPNESS, WEIGHT, deconvolution_filters
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.tikhonov import tikhonov

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.reconstruction import AttentionUNet, PhaseCam3DUNet, Residual
+from kornia_tidy.reconstruction.heads import PlainHead
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 

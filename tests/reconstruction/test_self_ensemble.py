@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.reconstruction import (
     JointClosedFormHead,
     JointHead,
@@ -16,6 +15,7 @@ from kornia_tidy.reconstruction import (
     receptive_field,
     self_ensemble,
 )
+from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from tests.base import BaseTester

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from kornia_tidy.inference.heads import PlainHead
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import (
     AttentionUNet,
@@ -26,6 +25,7 @@ from kornia_tidy.reconstruction import (
     reconstruct_tiled,
 )
 from kornia_tidy.reconstruction.head_memory import head_bytes
+from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.receptive_field import maps_of, total_stride
 from kornia_tidy.reconstruction.tile_grid import TileGrid
 from kornia_tidy.reconstruction.tiled import SEAM, shared_copy

@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from kornia_tidy import PSFBank, SensorNoise, TiDyOptics
+from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.reconstruction.tikhonov import BORDERS, Preconditioned, tikhonov, transfer_function
 from kornia_tidy.reconstruction.wiener import Wiener, transfer_moments, wiener
-from kornia_tidy.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from tests.base import BaseTester
 from tests.reconstruction.banks import make_bank, make_psfs
 from tests.rounding import gamma

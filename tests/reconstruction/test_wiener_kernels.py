@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from kornia_tidy.data.scene_statistics import SceneStatistics
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.wiener import wiener
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
-from kornia_tidy.scene_statistics.statistics import SceneStatistics
 from tests.base import BaseTester
 
 EVEN = SceneStatistics(exponent=2.9, knee=1 / 32, mean=0.3, spread=0.2)  # all depths alike; kernels decay sooner

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.camera.samples import read_sample
+from kornia_tidy.design.tradeoff.costs import peak_bytes
 from kornia_tidy.render.bands import padded_band
 from kornia_tidy.render.borders import BORDERS, pad_border
-from kornia_tidy.tradeoff.costs import peak_bytes
 from tests.base import BaseTester
 
 

@@ -10,9 +10,9 @@ import torch
 from scipy.signal import fftconvolve
 
 from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, TiDyOptics
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.stray_light import normalised_share, share_within
-from kornia_tidy.systems import SYSTEMS
 from tests.base import BaseTester
 from tests.render.scenes import brute_share_within
 

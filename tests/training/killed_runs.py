@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from kornia_tidy.inference import heads
-from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.reconstruction import heads
+from kornia_tidy.reconstruction.state_file import read_state
 from kornia_tidy.training import callbacks, run
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings

@@ -12,7 +12,7 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, photographic_leaves
-from kornia_tidy.inference.tasks import normalised_inverse_depth
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.data_sets import PAINTED, SCENES, _photographs, make_scenes
 from kornia_tidy.training.scenes import SceneLoader

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.inference.trained import load_trained
-from kornia_tidy.mask_design.candidates import FLAT, Candidate
-from kornia_tidy.mask_design.co_design import CoDesign
-from kornia_tidy.mask_design.design_report import design_files
-from kornia_tidy.mask_design.design_task import DesignTask
-from kornia_tidy.mask_design.verdict import Finalist, Verdict
+from kornia_tidy.design.candidates import FLAT, Candidate
+from kornia_tidy.design.co_design import CoDesign
+from kornia_tidy.design.design_report import design_files
+from kornia_tidy.design.design_task import DesignTask
+from kornia_tidy.design.verdict import Finalist, Verdict
 from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.design_folder import designed_settings
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from kornia_tidy.cli import main
-from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.reconstruction.state_file import read_state
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")

@@ -11,8 +11,8 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, FresnelLens, ThinLensCamera, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.tasks import normalised_inverse_depth
-from kornia_tidy.inference.trained import TrainedSystem
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
+from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.training.evaluation import SceneResult, depth_row, evaluate, image_row, mean_row, table
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester

@@ -8,9 +8,9 @@ from torch import nn
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.state_file import write_state
-from kornia_tidy.inference.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
+from kornia_tidy.reconstruction.state_file import write_state
+from kornia_tidy.reconstruction.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.training.scenes import Broken, SceneLoader
 from kornia_tidy.training.settings import TrainingSettings

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.inference.tasks import normalised_inverse_depth
+from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.training.noise_free import LEVELS, NoiseFreeCaptures
 from kornia_tidy.training.noisy_crops import (
     FULL_WELL,

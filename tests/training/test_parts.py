@@ -12,11 +12,13 @@ import torch
 from torch import nn
 
 from kornia_tidy import DefocusRange, ThinLensCamera
-from kornia_tidy.inference.heads import make_head
-from kornia_tidy.inference.pretrained import FOLDER, PRETRAINED, load_pretrained
-from kornia_tidy.inference.settings import RENAMED, SystemSettings
-from kornia_tidy.inference.state_file import read_state, write_state
-from kornia_tidy.inference.tasks import (
+from kornia_tidy.reconstruction.depth_distribution import distribution_loss
+from kornia_tidy.reconstruction.heads import make_head
+from kornia_tidy.reconstruction.metrics import psnr, ssim
+from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.settings import RENAMED, SystemSettings
+from kornia_tidy.reconstruction.state_file import read_state, write_state
+from kornia_tidy.reconstruction.tasks import (
     centre_crop,
     depth_logits,
     deviation_in_metres,
@@ -24,9 +26,7 @@ from kornia_tidy.inference.tasks import (
     normalised_inverse_depth,
     split_maps,
 )
-from kornia_tidy.inference.trained import TrainedSystem
-from kornia_tidy.reconstruction.depth_distribution import distribution_loss
-from kornia_tidy.reconstruction.metrics import psnr, ssim
+from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.random_state import own_random_state, random_state, random_states, seeded, set_random_state
 from kornia_tidy.training.settings import JOINT_RUN, NETWORK_RUN, TrainingSettings, usual_settings

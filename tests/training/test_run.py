@@ -10,8 +10,8 @@ import torch
 
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.files import only_here
-from kornia_tidy.inference import state_file
-from kornia_tidy.inference.state_file import read_state
+from kornia_tidy.reconstruction import state_file
+from kornia_tidy.reconstruction.state_file import read_state
 from kornia_tidy.training import data_sets, scenes
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester

@@ -9,7 +9,7 @@ import shutil
 import pytest
 import torch
 
-from kornia_tidy.inference.state_file import read_state, write_state
+from kornia_tidy.reconstruction.state_file import read_state, write_state
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")

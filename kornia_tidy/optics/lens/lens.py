@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_number, described
 from kornia_tidy.files import write_bytes
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.ideal_table import read_zernike_table, seidel_wavefront
 from kornia_tidy.optics.lens.lens_file import lens_bytes, lens_parts
 from kornia_tidy.optics.lens.lens_table import LensSample, LensTable
@@ -26,7 +27,6 @@ from kornia_tidy.optics.lens.made_lenses import (
 from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import light_through_stop
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.runtime.default_device import on_cpu
 from kornia_tidy.tensor_files import parse_tensors, read_tensors
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_positive
 from kornia_tidy.files import parse_json
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens_table import EXACT, LensTable
 from kornia_tidy.optics.lens.made_lenses import LensParts
-from kornia_tidy.runtime.default_device import on_cpu
 
 _FORMAT = "kornia_tidy.lens/1"
 _SCALARS = ("focal_length", "f_number", "focus_distance", "residual")

@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from kornia_tidy.checks import check_choice, check_metres, check_number, check_positive
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.first_order import first_order
 from kornia_tidy.optics.lens.ideal_table import Wavefront, ideal_table
 from kornia_tidy.optics.lens.lens_table import LensTable
@@ -16,7 +17,6 @@ from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.table_fit import fit_table
 from kornia_tidy.optics.spectrum import LONGEST, REFERENCE_WAVELENGTH, SHORTEST
 from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
-from kornia_tidy.runtime.default_device import on_cpu
 
 RGB = (470e-9, REFERENCE_WAVELENGTH, 610e-9)
 WIDEST = 20.0  # radians; nearer depths than of this defocus are in a table only where focus is farther away

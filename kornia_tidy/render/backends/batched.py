@@ -13,6 +13,7 @@ from itertools import count
 
 from torch import Tensor
 
+from kornia_tidy.kernels.precision import widest
 from kornia_tidy.kernels.window_sides import needed_side, next_fast_size
 from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
 from kornia_tidy.render.backends.allocator import keep_memory
@@ -25,7 +26,6 @@ from kornia_tidy.render.backends.tiles import Grid, Plan, plan_pairs
 from kornia_tidy.render.backends.whole_occlusion import occlude_whole, whole_gradients
 from kornia_tidy.render.backends.whole_sums import WholeSums
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
-from kornia_tidy.runtime.precision import widest
 
 MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
 PART_BYTES = 672 << 20  # that the planes of a chunk may take on an accelerator

@@ -16,12 +16,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.precision import widest
 from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, OcclusionPlanes, cumulative_weight
 from kornia_tidy.render.backends.tiles import Chunk, Plan, part_of, windows
 from kornia_tidy.render.backends.whole_occlusion import EPSILON_FLOAT32
 from kornia_tidy.render.layers import weight_of_layer
-from kornia_tidy.runtime.precision import widest
 
 
 class _Inputs(NamedTuple):

@@ -21,11 +21,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.precision import widest
 from kornia_tidy.render.backend import GradientPairs, wants_gradient
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, OcclusionPlanes, cumulative_weight
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
 from kornia_tidy.render.layers import weight_of_layer
-from kornia_tidy.runtime.precision import widest
 
 EPSILON_FLOAT32 = 1e-3  # as in the source: on devices without float64 round-off is some 1e-7 of the light
 

@@ -7,5 +7,5 @@
 - Differences are paired: taken scene by scene, then averaged, with the standard error of that mean.
 
 ``measure.py`` runs it and keeps every value in ``store.py``; ``report.py`` writes the tables, ``verdicts.py`` compares
-with the targets. A new restoration is a line in ``restorations.py``, a new optical system one in ``systems.py``.
+with the targets. A new restoration is a line in ``restorations.py``, a new optical system one in ``optics.py``.
 """

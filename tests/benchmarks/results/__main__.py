@@ -27,8 +27,8 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from kornia_tidy.design.tradeoff.conditions import device_name
 from kornia_tidy.files import write_bytes
-from kornia_tidy.tradeoff.conditions import device_name
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, sensor_of
 from tests.benchmarks.results.figure import draw_results
 from tests.benchmarks.results.measure import Measurement

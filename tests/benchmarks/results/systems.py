@@ -12,13 +12,13 @@ from torch import nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.inference.hub import from_pretrained
-from kornia_tidy.inference.pretrained import PRETRAINED, load_pretrained, pretrained_settings
-from kornia_tidy.inference.trained import TrainedSystem, load_trained
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.systems.presets import SYSTEMS
+from kornia_tidy.reconstruction.hub import from_pretrained
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_settings
+from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 
 WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded apertures by 0.4 to 0.7 dB
 FIDELITY = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from kornia_tidy.design.candidates import FLAT
+from kornia_tidy.design.design_report import DATA
 from kornia_tidy.files import read_json
-from kornia_tidy.mask_design.candidates import FLAT
-from kornia_tidy.mask_design.design_report import DATA
 from kornia_tidy.sensor.exposure import electrons_at
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, REFERENCE_F_NUMBER
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE

@@ -1,0 +1,362 @@
+"""Planner: choice of the cheapest fidelity within an error tolerance, predicted without rendering.
+
+The error is the root mean square difference between the noise-free capture and that of the preset ``reference``, in
+linear light with full scale 1. Light beyond full scale is not clipped: a highlight of 1000 gives errors a thousand
+times those of white. The error is predicted from the power of the scene in each octave and at each depth, see
+:mod:`kornia_tidy.accuracy.error_model`, and the cost is counted in operations, see
+:mod:`kornia_tidy.accuracy.costs`. The candidates are all combinations of layers, spacing, window, quadrature
+points per pixel and precision. The light outside the window is spread over the image or renormalised into the window,
+whichever is more accurate.
+
+The prediction is the sum of the errors of all single changes, each times a safety factor. It is an upper estimate,
+which holds on the scenes of ``tests/accuracy/adversarial_scenes.py``. It is not a strict bound, since the light of one
+octave is assumed to have random phases.
+
+Occlusion is not a sum over layers. Its error from changes of PSFs is estimated as that of scatter, for two images: the
+light itself, and its difference to the brightest light nearby, since dark objects occlude bright ones. Three errors are
+added that scatter does not have: the position of layers at occluding edges, the sharpness of outlines with a PSF cut to
+its window, and the darkening of pixels that are reached by a small part of a PSF.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from kornia_tidy.accuracy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_steps
+from kornia_tidy.accuracy.costs import bank_work, rendering_work, window_side
+from kornia_tidy.accuracy.depth_energy import Depths
+from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
+from kornia_tidy.accuracy.psf_samples import PSFSamples, remembered
+from kornia_tidy.accuracy.render_plan import RenderPlan
+from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
+from kornia_tidy.checks import check_positive
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes
+from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.render.backend import Work
+from kornia_tidy.render.backends.dense_occlusion import EPSILON
+from kornia_tidy.render.borders import cropped
+from kornia_tidy.render.stray_light import share_in_frame, share_within
+
+SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.3 times the formula
+WINDOW_SAFETY = 1.7  # factor for windows; measured up to 1.5, as tails are sampled at a few depths only
+FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; measured with mutual intensity up to 3.3e-7
+POINT_SAFETY = 1.6  # factor for quadrature points; measured up to 1.5, as they are sampled at a few depths only
+OCCLUSION = 1.3  # ratio of occlusion's error to the prediction for scatter; measured up to 1.1, before SAFETY
+OCCLUSION_WINDOW = 1.3  # the same ratio for windows
+ORDER_ERROR = 4e-3  # of occlusion, relative to the contrast, per radian between linear layers; measured up to 1.9e-3
+OUTLINE_ERROR = 2e-2  # the same, relative to the contrast at outlines; measured up to 1.9e-2
+_OUTLINE = 1.0  # rad between neighbouring pixels; larger steps are outlines of objects
+_ENOUGH = 0.05  # of the tolerance: with errors below it, more wavelengths bring nothing
+_DEPTHS = 16  # of the scene at which PSFs are compared
+_WINDOW = 65  # px, to compare all but windows: a fifth of the light lies outside, but a few per cent of its square
+
+
+class Planner(PSFSamples):
+    """Planner of scenes for one camera; PSF samples of the masks are computed once and shared by all scenes.
+
+    The samples belong to the masks at the time of construction. ``optics.plan`` plans one scene for one tolerance.
+
+    Args:
+        optics: the camera.
+        channels: number of channels of the images: that of the spectrum, or 1.
+
+    Example:
+        >>> from kornia_tidy import PixelwiseMask, TiDyOptics
+        >>> planner = Planner(TiDyOptics(PixelwiseMask(1, initial="flat")), channels=3)
+        >>> scene = planner.scene(torch.full((1, 1, 64, 64), -5.0))
+        >>> [scene.plan(tolerance).predicted_error <= tolerance for tolerance in (1e-1, 1e-2)]
+        [True, True]
+    """
+
+    def scene(self, defocus: Tensor, light: Tensor | None = None) -> PlannedScene:
+        """Return a scene to ask for errors and plans.
+
+        Args:
+            defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+            light: (B, C, H, W) linear light. Default: a typical photograph.
+        """
+        return PlannedScene(self, defocus, light)
+
+
+class PlannedScene:
+    """Error prediction and plans for one scene, made by :meth:`Planner.scene`.
+
+    Attributes:
+        planner: of the camera.
+        images: number of images.
+        reference: fidelity that errors refer to.
+        light: power of the light by channel, octave and depth.
+        level: root mean square of the light.
+    """
+
+    @torch.no_grad()
+    def __init__(self, planner: Planner, defocus: Tensor, light: Tensor | None) -> None:
+        height, width = defocus.shape[-2:]
+        self.images = len(defocus if light is None else light)
+        self.planner, self._defocus = planner, defocus.detach()
+        self._known: dict[Any, Any] = {}
+        self.reference = planner.reference(height, width)
+        self._full = window_side(self.reference)
+        self._narrow = self._full if planner.wide_blur else min(_WINDOW, self._full)
+        size = spectrum_size(self._full)
+        colours = range(1, len(planner.spectrum.basis or (1,)))
+        margin = self._full // 2 if planner.border == "valid" else 0
+        bins = 256 if planner.compositing == "gather" else 128
+        self._depths = Depths(defocus, *planner.model.camera.defocus_range, planner.border, margin, bins)
+        if light is None:  # differences between channels are assumed as large as between pixels
+            self.light, self.level = SceneLight.unseen(self._depths, planner.channels, size), 0.5
+            self._contrast = CONTRAST
+            self._apart = torch.full((planner.channels, len(self._depths.psi)), CONTRAST, dtype=torch.float64)
+            self._colours = [self.light for _ in colours]
+        else:
+            self.light, self.level = self._seen_light(light, size), float(light.double().square().mean().sqrt())
+            self._contrast = float(light.double().std(correction=0))
+            means = self._depths.means(light)  # mean light of each depth less that of the image
+            self._apart = means / self._depths.share - means.sum(1, keepdim=True)
+            self._colours = [self._seen_light(light.roll(-k, 1) - light, size) for k in colours]
+        self._at = tuple(self.light.depths(_DEPTHS))
+        self._outlines = self._at_outlines(light) if self._occlusion else 0.0
+
+    def _seen_light(self, light: Tensor, size: int) -> SceneLight:
+        return SceneLight.seen(light, self._depths, self.planner.border, size, self.planner.compositing)
+
+    def error(self, fidelity: Fidelity) -> float:
+        """Return the predicted error, full scale 1, of an exact fidelity with a window up to the reference's."""
+        return sum(error for _, error in self._parts(fidelity))
+
+    def operations(self, fidelity: Fidelity) -> float:
+        """Return the operations of a capture with its PSFs, those of float64 counted twice."""
+        return self.planner.captures * sum(work.operations for work in self._works(fidelity))
+
+    def plan(self, tolerance: float) -> RenderPlan:
+        """Return the cheapest candidate predicted to be within the tolerance.
+
+        If no candidate is, the plan is the reference, which has no error by definition.
+        """
+        check_positive("tolerance", tolerance)
+        chosen = min(self._within(tolerance), key=self.operations, default=self.reference)
+        if self.operations(chosen) >= self.operations(self.reference):
+            return self._described(self.reference, tolerance)
+        return self._described(replace(chosen, name=f"planned, tolerance {tolerance:g}"), tolerance)
+
+    def _within(self, tolerance: float) -> Iterator[Fidelity]:
+        """Yield the narrowest window within a tolerance for each combination of the other settings."""
+        windows, counts = window_steps(self._full), tuple(self._wavelength_counts(tolerance))
+        for layers, double, points, count in product(layer_kinds(), (False, True), PIXEL_TOLERANCES, counts):
+            full = replace(layers, window=windows[-1], double=double, pixel_tolerance=points, wavelengths=count)
+            if self.error(full) > tolerance:
+                continue
+            for stray_light in WINDOW_STRAY_LIGHT:
+                each = [replace(full, window=window, stray_light=stray_light) for window in windows[:-1]]
+                first = bisect_left(each, True, key=lambda narrower: self.error(narrower) <= tolerance)
+                yield (*each, full)[first]
+
+    def _wavelength_counts(self, tolerance: float) -> Iterator[int | None]:
+        """Yield candidate numbers of wavelengths, up to the first with an error small against the tolerance."""
+        for count in self.planner.wavelength_counts():
+            error = SAFETY * self._wavelength_error(count)
+            if error <= tolerance:
+                yield count
+            if error <= _ENOUGH * tolerance:
+                return
+        yield None
+
+    def _described(self, fidelity: Fidelity, tolerance: float) -> RenderPlan:
+        planner, (bank, rendering) = self.planner, self._works(fidelity)
+        layers = self._layers(fidelity.layers, fidelity.layer_spacing)
+        held = planner.captures * max(1.0, len(nodes_around(self._rendered(fidelity), self._defocus)) / layers[0])
+        return RenderPlan(
+            fidelity=fidelity,
+            reference=self.reference,
+            tolerance=tolerance,
+            predicted_error=self.error(fidelity),
+            error_parts=tuple(self._parts(fidelity)),
+            operations=self.operations(fidelity),
+            reference_operations=self.operations(self.reference),
+            memory_bytes=max(round(held * bank.memory), rendering.memory),
+            layers=layers,
+            window=window_side(fidelity),
+            wavelengths=(len(planner.spectrum_of(fidelity).wavelengths), len(planner.spectrum.wavelengths)),
+            states=planner.captures,
+        )
+
+    def _parts(self, fidelity: Fidelity) -> list[tuple[str, float]]:
+        share, of_window = (OCCLUSION, OCCLUSION_WINDOW) if self._occlusion else (1.0, 1.0)
+        share, of_window = (factor / self._share_in_frame for factor in (share, of_window))
+        narrower = window_side(fidelity) < self._full
+        ways = (fidelity.stray_light, *(["outlines"] if self._occlusion and narrower else []))
+        window_error = of_window * max(self._window_error(window_side(fidelity), way) for way in ways)
+        layer_error = SAFETY * share * self._layer_error(fidelity.layers, fidelity.layer_spacing)
+        return [
+            ("layers", layer_error + self._order_error(fidelity) + self._dark_error(fidelity)),
+            ("window", WINDOW_SAFETY * window_error + self._spread_error(fidelity)),
+            ("points a pixel", POINT_SAFETY * share * self._point_error(fidelity.pixel_tolerance)),
+            ("wavelengths", SAFETY * share * self._wavelength_error(fidelity.wavelengths)),
+            ("float32", 0.0 if fidelity.double else FLOAT32_ERROR * self.level),
+        ]
+
+    # ---------------------------------------------------------------------- errors of single changes
+
+    @cached_property
+    def _psfs(self) -> Tensor:
+        """PSFs at some depths of the scene, in the window of the reference."""
+        return self.planner.psfs(self._at, self._full, dtype=torch.float32)
+
+    @remembered
+    def _held(self, window: int) -> Tensor:
+        """Return the share of the light in a window, at some depths of the scene, (D, C)."""
+        return cropped(self._psfs, (self._full - window) // 2).sum((-2, -1)).double()
+
+    @remembered
+    def _layer_error(self, layers: str, spacing: float) -> float:
+        reference = self._layered(REFERENCE.layers, REFERENCE.layer_spacing)
+        return change_error(self._at, self._layered(layers, spacing) - reference, self.light, alternate=True)
+
+    @remembered
+    def _window_error(self, window: int, stray_light: str) -> float:
+        psfs, margin = self._psfs, (self._full - window) // 2
+        if stray_light == "outlines":  # PSFs are normalised in both windows, with and without stray light
+            psfs = psfs / psfs.sum((-2, -1), keepdim=True)
+        kept = cropped(psfs, margin)
+        if stray_light != "veil":
+            kept = kept / kept.sum((-2, -1), keepdim=True)
+        changes = -psfs
+        cropped(changes, margin).add_(kept)
+        return change_error(self._at, changes, self.light)
+
+    @remembered
+    def _point_error(self, tolerance: float) -> float:
+        return change_error(self._at, self._sampled(tolerance) - self._sampled(REFERENCE.pixel_tolerance), self.light)
+
+    @remembered
+    def _sampled(self, tolerance: float) -> Tensor:
+        """Return PSFs at all wavelengths: that of the shortest changes most."""
+        return self.planner.psfs(self._at, self._narrow, tolerance, None)
+
+    @remembered
+    def _wavelength_error(self, count: int | None) -> float:
+        r"""Return the error from binned wavelengths.
+
+        With a reflectance basis, channel c captures :math:`h_c * L_c + \sum_b h_{cb} * (L_b - L_c)` with the PSF
+        :math:`h_c = \sum_b h_{cb}` of white.
+        """
+        if count is None or count >= len(self.planner.spectrum.wavelengths):
+            return 0.0
+        changes = self._binned(count) - self._binned(None)
+        own = torch.arange(len(changes[0]))
+        colours = [changes[:, own, (own + k) % len(own)] for k in range(1, changes.shape[2])]
+        changed = zip((changes.sum(2), *colours), (self.light, *self._colours), strict=True)
+        return sum(change_error(self._at, change, light) for change, light in changed)
+
+    @remembered
+    def _binned(self, count: int | None) -> Tensor:
+        return self.planner.binned(count, self._at, self._narrow)
+
+    @remembered
+    def _layered(self, layers: str, spacing: float) -> Tensor:
+        return self.planner.layered(layers, spacing, self._at, self._narrow)
+
+    # ---------------------------------------------------------------------- what occlusion adds
+
+    @property
+    def _occlusion(self) -> bool:
+        return self.planner.compositing == "occlusion"
+
+    def _at_outlines(self, light: Tensor | None) -> float:
+        """Return the root mean square, over all pixels, of the contrast of those with a neighbour at another depth."""
+        nearest, farthest = (max_pool2d(sign * self._defocus, 3, 1, 1) for sign in (1, -1))
+        outline = (nearest + farthest > _OUTLINE).double()
+        contrast = self._contrast * float(outline.mean().sqrt())
+        if light is None:
+            return contrast
+        brightest, darkest = (max_pool2d(sign * light.double(), 3, 1, 1) for sign in (1, -1))
+        return max(contrast, float((outline * (brightest + darkest).square()).mean().sqrt()))
+
+    @cached_property
+    def _share_in_frame(self) -> float:
+        """Least share of a PSF inside the image, averaged over pixels; 1 unless occlusion has the border ``"zero"``.
+
+        Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers the image alone: in a tiny image
+        PSFs are renormalised by the small share inside it, and their errors grow likewise.
+        """
+        if not self._occlusion or self.planner.border != "zero":
+            return 1.0
+        shares = share_in_frame(self._psfs, self._defocus.shape[-2:]) / self._held(self._full)
+        return min(1.0, float(shares.amin()))
+
+    def _order_error(self, fidelity: Fidelity) -> float:
+        """Return the error at occluding edges from layers at other positions than the reference's."""
+        if not self._occlusion or fidelity.layers == "nearest":
+            return 0.0  # nearest layers have much larger errors, which dominate
+        own, theirs = self._rendered(fidelity), self._rendered(self.reference)
+        if own == theirs:
+            return 0.0
+        each = max(ORDER_ERROR * self._contrast, OUTLINE_ERROR * self._outlines)
+        return each * (own[-1] - own[0]) / (len(own) - 1)
+
+    def _dark_error(self, fidelity: Fidelity) -> float:
+        """Return the error of occlusion from the regularised division by the cumulative alpha.
+
+        A layer with the share E of its PSF inside the window loses EPSILON / E of its light, so that white is not kept.
+        """
+        if not self._occlusion or replace(fidelity, name=self.reference.name) == self.reference:
+            return 0.0
+        held = self._held(window_side(fidelity)).amin(1)
+        lost = EPSILON / (interpolation(self._depths.psi, self._at) @ held) - EPSILON
+        return 2 * self.level * float((self._depths.share @ lost.square()).sqrt())
+
+    def _spread_error(self, fidelity: Fidelity) -> float:
+        """Return the error from stray light that is spread otherwise than the reference's.
+
+        Occlusion normalises each layer by its alpha, so the layer's stray light should have the mean of the layer. In
+        the others more stray light stays within a border ``"zero"`` where the window is narrower.
+        """
+        if fidelity.stray_light != "veil" or not (self._occlusion or self.planner.border == "zero"):
+            return 0.0
+        if not self._occlusion:
+            height, width = self._defocus.shape[-2:]
+            theirs, ours = (share_within(height, width, side) for side in (self._full, window_side(fidelity)))
+            stray = float((1 - self._held(self._full)).clamp(min=0).max())
+            return self.level * stray * float((ours - theirs).square().mean().sqrt())
+        lost = self._held(self._full) - self._held(window_side(fidelity))
+        lost = interpolation(self._depths.psi, self._at) @ lost * self._apart.T
+        return float((self._depths.share @ lost.square()).mean().clamp(min=0).sqrt())
+
+    # ---------------------------------------------------------------------- costs
+
+    @remembered
+    def _layers(self, layers: str, spacing: float) -> tuple[int, int]:
+        """Return how many PSFs are computed for the scene, from its farthest to its nearest, and of the whole range."""
+        nodes = self.planner.nodes(layers, spacing)
+        weights, sampled = layer_coefficients(self._depths.psi[[0, -1]], nodes, layers, self.planner.band)
+        used = torch.nonzero((weights != 0).any(0)).flatten()
+        return int(used[-1] - used[0] + 1), len(sampled)
+
+    def _rendered(self, fidelity: Fidelity) -> tuple[float, ...]:
+        """Return the defocus of the rendered layers."""
+        nodes = self.planner.nodes(fidelity.layers, fidelity.layer_spacing)
+        return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
+
+    def _works(self, fidelity: Fidelity) -> tuple[Work, Work]:
+        """Return the work of a bank of PSFs and of the renderer, for one capture of the scene."""
+        planner, (computed, _) = self.planner, self._layers(fidelity.layers, fidelity.layer_spacing)
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        rendering = self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
+        spectrum = planner.spectrum_of(fidelity)
+        return bank_work(planner.model, spectrum, planner.together, fidelity, computed), rendering
+
+    @remembered
+    def _rendering(self, layers: str, nodes: tuple[float, ...], window: int, double: bool) -> Work:
+        planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
+        how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
+        return rendering_work(*given, **how)

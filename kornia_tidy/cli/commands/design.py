@@ -1,0 +1,244 @@
+"""`kornia-tidy design`: co-design of aperture, focus and masks, and whether masks pay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from kornia_tidy.choices import BETWEEN
+from kornia_tidy.cli.commands.shared import Folder, check_folder
+from kornia_tidy.settings import DepthRange, Electrons, FNumber, Metres, Seconds, Seed, Unit, one_of
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from kornia_tidy.data.rgbd import Scene
+    from kornia_tidy.design.co_design import CoDesign, Effort
+    from kornia_tidy.design.design_task import DesignTask
+
+PROGRESS = "progress.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LensAndSensor:
+    """Lens and sensor.
+
+    Args:
+        focal_length: of the lens.
+        pixel_pitch: of the sensor.
+        electrons: of a white pixel at the reference f-number.
+        reference_f_number: f-number at which the electrons are counted.
+        full_well: electrons from black to white, which limit the exposure. None: by the pixel's area, 57000 at 8 um.
+        read_noise: its standard deviation.
+    """
+
+    focal_length: Metres = 0.05
+    pixel_pitch: Metres = 8e-6
+    electrons: Electrons = 57_000.0
+    reference_f_number: FNumber = 17.6
+    full_well: Electrons | None = None
+    read_noise: Electrons = 2.4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModulatorSettings:
+    """Modulator.
+
+    Args:
+        masks: in one exposure.
+        mask_size: pixels along a side of a mask, 20 of 23 of which span the aperture: more scatter less light.
+        bits: of its grey levels over one wave. None: any phase.
+        switching_time: from mask to mask.
+        exposure: of a capture.
+        between: phase while it switches.
+    """
+
+    masks: Annotated[int, Unit("K", "", 1, 64)] = 5
+    mask_size: Annotated[int, Unit("N", "", 1, 1024)] = 23
+    bits: Annotated[int, Unit("B", "", 1)] | None = None
+    switching_time: Seconds = 0.0
+    exposure: Seconds = 0.1
+    between: Annotated[str, one_of(BETWEEN)] = "exponential"
+
+    def modulator(self) -> nn.Module:
+        """Return what shows the masks."""
+        from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
+        from kornia_tidy.modulator.phase_panel import GreyLevels
+        from kornia_tidy.modulator.switching import Switching
+
+        parts: list[nn.Module] = [] if self.bits is None else [GreyLevels(self.bits)]
+        switching = self.switching_time > 0
+        timing = Switching(self.switching_time, self.exposure, self.between) if switching else DwellTimes()
+        return SpatialLightModulator(*parts, timing) if parts else timing
+
+
+@dataclass(frozen=True, kw_only=True)
+class Design:
+    """Design aperture, focus and masks together; do masks pay?
+
+    For extended depth of field, for depth, or for both. A wide aperture with masks gets
+    more light, a lens that is stopped down is sharper over a larger range of depths: which
+    of the two is ahead depends on the light and on the range of depths.
+
+    Everything is compared at the same exposure time: light is given as the electrons of a
+    white pixel at one f-number, and falls with the square of the f-number. Where white would
+    exceed the full well of a pixel the exposure is shorter.
+
+      search    flat lenses and masks at f-numbers one stop apart, by the error of the best linear
+                restoration (and of depth by texture); masks start from a
+                focal sweep, a Fisher mask and noise, and see the modulator's switching and
+                grey levels
+      captures  the best of both take pictures of scenes (dead leaves, and yours), which the
+                best closed form restores; settings are chosen on one half of the scenes,
+                scores are from the other
+    Masks are recommended only if they are ahead by more than two standard errors.
+
+    Args:
+        output: made if missing.
+        quick: fewer steps and scenes: a first answer, in 20 s on one core.
+        seed: of all that is random.
+        depth_range: nearest and farthest depth that the camera is for; the farthest may be inf.
+        depth_weight: share of depth in what matters, from 0, the image alone, to 1.
+        scenes: pictures with depth, which decide beside dead leaves; FOLDER/rgbd.json pairs them: {"image": "*.png",
+            "depth": "*_depth.png", "scale": 0.001}. None: dead leaves alone.
+        sensor: lens and sensor.
+        modulator: what shows the masks.
+    """
+
+    output: Folder = "outputs/design"
+    quick: bool = False
+    seed: Seed = 0
+    depth_range: DepthRange = (0.2975, math.inf)
+    depth_weight: Annotated[float, Unit("W", "", 0, 1)] = 0.0
+    scenes: Folder | None = None
+    sensor: LensAndSensor = field(default_factory=LensAndSensor)
+    modulator: ModulatorSettings = field(default_factory=ModulatorSettings)
+
+    notes: ClassVar = """\
+FOLDER gets report.md (read this first), design.png, report.json, masks.npy (heights of
+the best masks in metres) and camera.safetensors (the recommended camera):
+  kornia-tidy masks export FOLDER/camera.safetensors -o slm      frames for a modulator
+  kornia-tidy psf FOLDER/camera.safetensors --aperture-diameter A --focus-distance Z
+its PSFs, with the aperture and the focus that are printed at the end.
+After Ctrl-C the same command goes on where it stopped (FOLDER/progress.json).
+
+How many electrons? The full well of the pixel if white nearly saturates it. Else roughly
+  500 * illuminance in lux * exposure in seconds * (pixel pitch in um)^2 / f-number^2
+at a quantum efficiency of one half: 17,000 lux (day, in the shade) for 33 ms on 8 um
+pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
+"""
+    examples: ClassVar = """\
+  The camera of the paper in bright light, a first answer:
+    kornia-tidy design --quick
+
+  A range of 0.5 to 4 m in dim light, with a modulator of 8 bits that takes 4 ms:
+    kornia-tidy design --depth-range 0.5 4 --electrons 5000 --bits 8 \\
+        --switching-time 4e-3 --exposure 33e-3 -o outputs/dim
+
+  Image and depth count alike; your own scenes decide too:
+    kornia-tidy design --depth-weight 0.5 --scenes my/scenes -o outputs/both
+"""
+
+    def task(self) -> DesignTask:
+        """Return the task that the settings describe.
+
+        Raises:
+            ValueError: if a value is out of its range, or a length not in metres.
+        """
+        from kornia_tidy.design.design_task import DesignTask
+
+        return DesignTask(
+            depth_range=self.depth_range,
+            focal_length=self.sensor.focal_length,
+            pixel_pitch=self.sensor.pixel_pitch,
+            electrons=self.sensor.electrons,
+            reference_f_number=self.sensor.reference_f_number,
+            read_noise_electrons=self.sensor.read_noise,
+            masks=self.modulator.masks,
+            modulator=self.modulator.modulator(),
+            depth_weight=self.depth_weight,
+            mask_size=self.modulator.mask_size,
+            full_well_electrons=self.sensor.full_well,
+        )
+
+    def run(self) -> None:
+        """Design, and write the files."""
+        folder = check_folder(self.output)
+        from kornia_tidy.cli.commands.report import tell
+        from kornia_tidy.data.rgbd_folder import scenes_in
+        from kornia_tidy.design.co_design import Effort, expected_in_words, planned_work
+        from kornia_tidy.design.design_report import (
+            CAMERA,
+            DATA,
+            PICTURE,
+            REPORT,
+            exposure_in_words,
+            focus_distance,
+        )
+        from kornia_tidy.figures.style import require_matplotlib
+        from kornia_tidy.files import only_here
+
+        require_matplotlib()
+        task = self.task()
+        effort = Effort.quick() if self.quick else Effort()
+        scenes = [] if self.scenes is None else scenes_in(self.scenes)
+        folder.mkdir(parents=True, exist_ok=True)
+        with only_here(folder, "a design is running"):
+            work = planned_work(task, effort, len(scenes))
+            near, far = task.depth_range
+            tell("scene", f"depths {near:g} to {far:g} m, {effort.scenes} dead leaves, {len(scenes)} scenes of yours")
+            tell(
+                "light", f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g}, equal exposure time"
+            )
+            tell("work", expected_in_words(task, effort, work) + _earlier(folder / PROGRESS))
+            design = _with_progress(task, scenes, effort, self.seed, folder / PROGRESS, work)
+            _write(folder, design)
+        tell("verdict", design.words)
+        focus, f_number = focus_distance(task, design.recommended), design.recommended.f_number
+        tell("exposure", exposure_in_words(design))
+        tell("camera", f"f/{f_number:.3g}, aperture {task.focal_length / f_number:.3g} m, focus at {focus:.3g} m")
+        tell("wrote", f"{folder / REPORT}: read this one")
+        for name in (PICTURE, DATA, "masks.npy", CAMERA):
+            tell("", str(folder / name))
+
+
+def _earlier(progress_file: Path) -> str:
+    return f"; {progress_file} goes on, if it is of this design" if progress_file.exists() else ""
+
+
+def _with_progress(
+    task: DesignTask, scenes: list[Scene], effort: Effort, number: int, progress_file: Path, work: dict[str, int]
+) -> CoDesign:
+    """Run the co-design with a progress bar for each stage."""
+    from kornia_tidy.cli.commands.report import progress_bar, tell
+    from kornia_tidy.design.co_design import co_design
+
+    bars: dict[str, Any] = {}
+
+    def progress(stage: str, amount: int) -> None:
+        if stage not in bars:
+            for bar in bars.values():
+                bar.close()
+            bars[stage] = progress_bar(stage, total=work[stage])
+        bars[stage].update(amount)
+
+    try:
+        return co_design(task, scenes, effort, number, progress_file, progress)
+    except KeyboardInterrupt:
+        tell("stopped", "the same command goes on from here")
+        raise
+    finally:
+        for bar in bars.values():
+            bar.close()
+
+
+def _write(folder: Path, design: CoDesign) -> None:
+    from kornia_tidy.design.design_report import PICTURE, design_files
+    from kornia_tidy.figures.co_design import draw_co_design
+    from kornia_tidy.figures.style import encoded_figure
+    from kornia_tidy.files import write_bytes
+
+    for name, data in {**design_files(design), PICTURE: encoded_figure(draw_co_design(design))}.items():
+        write_bytes(folder / name, data)

@@ -1,0 +1,218 @@
+"""`kornia-tidy psf`: figure and numbers of a camera's PSFs over depth and colour, and over the field of a lens."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from kornia_tidy.choices import LENSES, SYSTEMS, Preset
+from kornia_tidy.cli.commands.parser import Argument, Parsed
+from kornia_tidy.cli.commands.shared import Out, Window, check_output
+from kornia_tidy.reconstruction.settings import LensSettings
+from kornia_tidy.settings import Choice, Count, Seed
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
+    from kornia_tidy.optics.lens.lens import Lens
+    from kornia_tidy.optics.thin_lens import ThinLensCamera
+
+COLUMNS = 7
+CELLS = 23  # of a pupil without masks that a lens's own stop cuts: as good as more, and faster
+
+
+def depths_of(text: str) -> tuple[float, ...]:
+    """Read depths in metres with commas between them, nearest first.
+
+    Example:
+        >>> depths_of("inf,0.5")
+        (0.5, inf)
+    """
+    try:
+        depths = [float(word) for word in text.split(",")]
+    except ValueError:
+        raise ValueError(f"must be metres with commas between them, got {text!r}") from None
+    if not all(depth > 0 for depth in depths):
+        raise ValueError(f"must be positive metres, got {text!r}")
+    return tuple(sorted(set(depths)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Psf:
+    """PSFs of a camera over depth and colour, and over the field of a lens.
+
+    Draws a montage of the point spread functions (PSFs) over depth and colour, a slice
+    through focus, and the modulation transfer function (MTF). CAMERA is the name of a
+    published system, a camera's state_dict (.safetensors), a checkpoint of a training
+    (best.safetensors), or a file of heights in metres (.npy).
+
+    --lens puts a real lens around the masks of a published system or a file of heights;
+    without CAMERA it is the lens without masks. --field draws PSFs at heights from the
+    axis to the corner, beside the lens's spot diagram.
+
+    Printed for each depth and colour:
+      held    share of a point's light inside the window (ensquared energy)
+      peak    share of the light in the brightest pixel
+      Strehl  the peak relative to that of the same lens in focus without a mask;
+              with --field to that of an ideal lens
+      MTF50   spatial frequency at which contrast falls to one half, in cycles per
+              pixel; 0.5 is the Nyquist limit
+
+    and with --field:
+      light   irradiance of an even scene relative to the axis
+      rays    root mean square distance of the lens's rays from their mean
+
+    The PSFs in Python:
+      from kornia_tidy import TiDyOptics
+      bank = TiDyOptics.from_preset("phasecam3d").psf_bank()  # bank.psfs, bank.defocus
+
+    Args:
+        camera: a file as above, or a published system. None: no masks, with --lens.
+        output: picture.
+        depths: depths with commas between them, inf allowed. None: 7 over the camera's range, even in inverse depth;
+            with --field 5, one of them in focus.
+        window: side of the PSFs, odd. None: as in a capture.
+        fidelity: speed or accuracy. None: balanced, or as saved.
+        mask_seed: of a system's masks.
+        settings: for --lens with a name, and for a file of masks alone; other cameras have their own.
+        lens: a real lens by its name, or a file that Lens.save wrote. None: an ideal lens, or as saved.
+        field: number of heights on the sensor from the axis to the corner that the lens is made for. None: the axis.
+    """
+
+    camera: Annotated[str, Argument("CAMERA")] | None = None
+    output: Out = "psf.png"
+    depths: Annotated[tuple, Parsed("A,B", "metres", read=depths_of)] | None = None
+    window: Window | None = None
+    fidelity: Preset | None = None
+    mask_seed: Seed = 0
+    settings: LensSettings = dataclasses.field(default_factory=LensSettings)
+    lens: Annotated[str, Choice("NAME|FILE", choices=LENSES, others=True)] | None = None
+    field: Count | None = None
+
+    examples: ClassVar = """\
+  kornia-tidy psf phasecam3d
+  kornia-tidy psf runs/edof/best.safetensors --depths 0.4,0.6,1,inf -o psfs.png
+  kornia-tidy psf heights.npy --focus-distance 1 --aperture-diameter 4e-3
+  kornia-tidy psf --lens double-gauss-50mm --f-number 8 --focus-distance 1 --field 5
+  kornia-tidy psf tidy-5 --lens single-50mm --field 3 --depths 0.4,0.6,inf
+"""
+
+    def run(self) -> None:
+        """Compute the PSFs, print their numbers and draw them."""
+        import torch
+
+        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.figures.field import airy_radius, draw_field
+        from kornia_tidy.figures.field_measures import heights_to_corner, measures_over_field
+        from kornia_tidy.figures.psf import draw_psfs
+        from kornia_tidy.figures.psf_measures import measures_of_psfs
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
+
+        if self.camera is None and self.lens is None:
+            raise ValueError("there is no camera: give CAMERA, --lens, or both")
+        check_output(self.output, self.camera, self.lens)
+        require_matplotlib()
+        stages = Stages()
+        with torch.no_grad(), stages("camera"):
+            optics = self._optics()
+            psi = self._defocus(optics)
+        if self.field is None:
+            with stages("PSFs"):
+                measured = measures_of_psfs(optics, psi)
+            name = Path(self.camera or self.lens or "").name
+            sheet = measured.sheet(f"PSFs of {name}, window {optics.window} x {optics.window} px")
+            with stages("picture"):
+                save_figure(self.output, draw_psfs(sheet))
+        else:
+            if optics.lens is None:
+                raise ValueError(f"--field is for a camera with a lens, and {self.camera} has none: give it --lens")
+            with stages("PSFs"):
+                measured = measures_over_field(optics, heights_to_corner(optics.lens, self.field), psi)
+            with stages("picture"):
+                save_figure(self.output, draw_field(measured, airy_radius(optics)), dpi=100)
+        tell("camera", optics.camera.extra_repr())
+        if optics.lens is not None:
+            tell("lens", optics.lens.extra_repr())
+        tell("masks", optics.masks.extra_repr())
+        tell("window", f"{optics.window} x {optics.window} px, fidelity {optics.fidelity.name!r}")
+        print("", *measured.table(), "", sep="\n")
+        tell("wrote", f"{self.output}: look at it")
+        tell("time", stages.summary())
+
+    def _optics(self) -> TiDyOptics:
+        """Return the camera, with stray light discarded so that the ensquared energy can be measured."""
+        import torch
+
+        from kornia_tidy.camera.tidy_optics import TiDyOptics
+        from kornia_tidy.lab.mask_export.mask_files import SUFFIXES, read_heights
+        from kornia_tidy.masks.no_mask import NoMask
+        from kornia_tidy.masks.pixelwise import PixelwiseMask
+        from kornia_tidy.reconstruction.trained import load_camera
+
+        name, fidelity, generator = self.camera, self.fidelity or "balanced", torch.Generator()
+        suffix = "" if name is None else Path(name).suffix.lower()
+        if name is not None and name not in SYSTEMS and suffix not in SUFFIXES:
+            raise ValueError(
+                f"CAMERA must be one of {', '.join(map(repr, SYSTEMS))}, or a file (.npy, .safetensors), got {name!r}"
+            )
+        saved = None if name is None or name in SYSTEMS or suffix == ".npy" else load_camera(name)
+        if saved is not None and self.lens is not None:
+            raise ValueError(f"{name} has a lens of its own: --lens is for files of masks alone and published systems")
+        if (saved is not None or (name in SYSTEMS and self.lens is None)) and self.settings != LensSettings():
+            raise ValueError(f"{name} has a lens of its own: --focal-length and the like are for files of masks alone")
+        camera, lens = self._lens()
+        if name is None:
+            optics = TiDyOptics(NoMask(CELLS), camera, fidelity=fidelity, lens=lens)
+        elif name in SYSTEMS:
+            other = {} if lens is None else {"camera": camera, "lens": lens}
+            generator.manual_seed(self.mask_seed)
+            optics = TiDyOptics.from_preset(name, generator=generator, fidelity=fidelity, **other)
+        elif saved is None:
+            optics = TiDyOptics(PixelwiseMask(initial=read_heights(name)), camera, fidelity=fidelity, lens=lens)
+        else:
+            optics = saved if self.fidelity is None else saved.with_fidelity(fidelity)
+        settings = optics.fidelity
+        window = optics.window if self.window is None else self.window
+        return optics.with_fidelity(settings.replace(name=settings.name, window=window, stray_light="discard"))
+
+    def _lens(self) -> tuple[ThinLensCamera, Lens | str | None]:
+        """Return the camera of the options, which is that of the lens where there is one."""
+        from kornia_tidy.optics.lens.lens import Lens
+        from kornia_tidy.optics.lens.made_lenses import named_focal_length
+
+        given = [name for name, value in vars(self.settings).items() if value != getattr(LensSettings(), name)]
+        if self.lens is None:
+            return self.settings.camera(), None
+        if self.lens in LENSES:
+            _refuse(self.lens, given, ("focal_length",))
+            return replace(self.settings, focal_length=named_focal_length(self.lens)).camera(), self.lens
+        if not Path(self.lens).is_file():
+            raise FileNotFoundError(
+                f"--lens must be one of {', '.join(map(repr, LENSES))}, or a file, got {self.lens!r:.80}"
+            )
+        _refuse(self.lens, given, ("focal_length", "f_number", "aperture_diameter", "focus_distance"))
+        lens = Lens.load(self.lens)
+        return lens.camera(self.settings.pixel_pitch, self.settings.depth_range), lens
+
+    def _defocus(self, optics: TiDyOptics) -> Tensor:
+        """Return the defocus of the requested depths in radians, ascending, (D,)."""
+        import torch
+
+        from kornia_tidy.figures.field_measures import depths_around_focus
+
+        lo, hi = optics.camera.defocus_range
+        if self.depths is not None:
+            return optics.camera.defocus(torch.tensor(self.depths[::-1], dtype=torch.float64))
+        if self.field is not None:
+            return depths_around_focus(optics.camera)
+        return torch.linspace(lo, hi, COLUMNS, dtype=torch.float64)
+
+
+def _refuse(lens: str, given: list[str], own: tuple[str, ...]) -> None:
+    """Raise ``ValueError`` if an option was given for what a lens has of its own."""
+    for name in given:
+        if name in own:
+            raise ValueError(f"the lens {lens} has its own: leave out --{name.replace('_', '-')}")

@@ -1,0 +1,90 @@
+"""`kornia-tidy raw calibrate-noise`: a camera's gain and read noise from its raw files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from kornia_tidy.cli.commands.parser import Optional
+from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
+from kornia_tidy.cli.commands.shared import File, check_outputs
+from kornia_tidy.settings import Unit
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateNoise:
+    """Measure gain and read noise.
+
+    At one ISO setting, by photon transfer: a fit of the variance of the counts over their
+    level gives the electrons per count (gain) and the noise without light (read noise).
+    FILES are
+      flats     two or more captures of each exposure, in any order, of a static scene:
+                best an evenly lit sheet out of focus, from dark to nearly saturated.
+                Differences of captures are measured, so that scene and fixed pattern
+                cancel
+      one file  any scene with smooth areas of different brightness. Noise is separated
+                from texture block by block; the printed error shows how reliably
+    Pictures that do not allow a calibration are refused with the reason.
+
+    Args:
+        files: camera raw files of one camera and ISO.
+        output: where the calibration goes, OUT.json.
+        dark: captures without light: black is measured in them. None: black as the files say.
+        plot: draw the photon-transfer curve, without a name as OUT.png beside OUT.json. None: it is not drawn.
+        dump: what a headerless file holds.
+    """
+
+    files: RawFiles
+    output: Annotated[str, Unit("OUT.json")]
+    dark: tuple[File, ...] = ()
+    plot: Annotated[str, Optional("OUT.png")] | None = None
+    dump: Dump = field(default_factory=Dump)
+
+    notes: ClassVar = """\
+In Python:
+  from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
+  sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
+"""
+    examples: ClassVar = """\
+  Pairs of flats at ISO 800, with two captures under the lens cap:
+    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json --plot
+
+  From a single picture:
+    kornia-tidy raw calibrate-noise street.cr2 -o noise.json
+"""
+
+    def run(self) -> None:
+        """Calibrate, write the results, and print a summary."""
+        output = Path(self.output)
+        plot = None if self.plot is None else Path(self.plot or output.with_suffix(".png"))
+        _check_outputs(output, plot, [*self.files, *self.dark])
+        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.figures.style import save_figure
+        from kornia_tidy.figures.transfer import draw_transfer
+        from kornia_tidy.lab.calibration.noise.photon_transfer import photon_transfer, write_json
+
+        stages = Stages()
+        with stages("read"):
+            captures, darks = ([self.dump.open(path) for path in paths] for paths in (self.files, self.dark))
+        with stages("measure"):
+            result = photon_transfer(captures, darks)
+        with stages("write"):
+            write_json(output, result)
+            if plot is not None:
+                save_figure(plot, draw_transfer(result))
+        for topic, text in result.in_words():
+            tell(topic, text)
+        tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
+        tell("time", stages.summary())
+
+
+def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
+    """Check before any work that outputs can be written and do not replace captures."""
+    if plot is not None:
+        from kornia_tidy.checks import check_choice
+        from kornia_tidy.figures.style import require_matplotlib
+
+        require_matplotlib()
+        check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))
+    check_outputs([output, plot], inputs)

@@ -1,0 +1,191 @@
+"""`kornia-tidy raw develop`: pictures from camera raw files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from kornia_tidy.choices import ADAPTATIONS, DEMOSAIC, HIGHLIGHTS
+from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, for_each_file, white_balance
+from kornia_tidy.cli.commands.shared import Folder
+from kornia_tidy.settings import one_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kornia_tidy.lab.raw.capture import RawCapture
+
+SUFFIXES = {"png": ".png", "tiff": ".tif"}
+Format = Annotated[str, one_of(("png", "tiff"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DevelopRaw:
+    """Make pictures of raw files.
+
+    Black and white levels, white balance, demosaicing, colour conversion to sRGB, upright
+    orientation and square pixels. Nothing is brightened, sharpened or denoised. Each FILE
+    becomes FOLDER/FILE.png, 16 bits, and a preview FOLDER/FILE.jpg. Files are written
+    atomically. Exit status 2 if any file failed; the others are developed all the same.
+
+    Args:
+        files: camera raw files.
+        output: where to; made if it is not there.
+        format: of the 16-bit picture.
+        no_preview: no JPEG beside it.
+        resume: keep pictures that are there, develop the others.
+        demosaic: method. None: LibRaw's AHD for Bayer, Markesteijn's for X-Trans, else bilinear.
+        white_balance: as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour.
+            None: as shot, else daylight, else none.
+        highlights: clip all channels where the first saturates, or keep what others saw above.
+        adaptation: chromatic adaptation of eyes. None: only the white balance, as LibRaw.
+        linear: linear light in the 16-bit picture, not encoded as sRGB.
+        sensor_grid: pixels as on the sensor: neither turned nor stretched.
+        dump: what a headerless file holds.
+    """
+
+    files: RawFiles
+    output: Folder
+    format: Format = "png"
+    no_preview: bool = False
+    resume: bool = False
+    demosaic: Annotated[str, one_of(DEMOSAIC)] | None = None
+    white_balance: WhiteBalance = ()
+    highlights: Annotated[str, one_of(HIGHLIGHTS)] = "clip"
+    adaptation: Annotated[str, one_of(ADAPTATIONS)] | None = None
+    linear: bool = False
+    sensor_grid: bool = False
+    dump: Dump = field(default_factory=Dump)
+
+    examples: ClassVar = """\
+  All files of a folder; if interrupted, go on with --resume:
+    kornia-tidy raw develop shots/*.dng -o pictures
+
+  For measurements: linear light on the pixel grid of the sensor, without interpolation:
+    kornia-tidy raw develop shots/*.dng -o planes --demosaic half --linear --sensor-grid
+
+  Files without a white balance, which look green or orange:
+    kornia-tidy raw develop quicktake/*.qtk -o pictures --white-balance auto
+
+  A headerless dump of counts, with factors for red, green and blue:
+    kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \\
+        --white-balance 1.9 1 1.5 -o pictures
+"""
+    notes: ClassVar = """\
+The first example in Python:
+  from kornia_tidy.data.image_files import write_image
+  from kornia_tidy.lab.raw.capture import RawCapture
+  from kornia_tidy.lab.raw.develop import develop
+  write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
+"""
+
+    def run(self) -> None:
+        """Develop raw files."""
+        import torch
+
+        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.data.image_files import write_image
+        from kornia_tidy.lab.raw.develop import develop, encode
+
+        balance = white_balance(self.white_balance)
+        folder = Path(self.output)
+        suffixes = [SUFFIXES[self.format], *([] if self.no_preview else [".jpg"])]
+        outputs = output_paths(self.files, folder, suffixes)
+        folder.mkdir(parents=True, exist_ok=True)
+        done = {"developed": 0, "kept": 0}
+        stages = Stages()
+
+        def work(path: str) -> None:
+            place = f"{list(outputs).index(path) + 1}/{len(outputs)}"
+            paths = outputs[path]
+            if self.resume and all(output.exists() for output in paths):
+                done["kept"] += 1
+                tell(place, f"{path}: kept {paths[0]}")
+                return
+            with stages("decode"):
+                raw = self.dump.open(path)
+            with stages("develop"), torch.no_grad():
+                image = develop(
+                    raw,
+                    self.demosaic,
+                    white_balance=balance,
+                    highlights=self.highlights,
+                    adaptation=self.adaptation,
+                    encoded=False,
+                    square_pixels=not self.sensor_grid,
+                    upright=not self.sensor_grid,
+                )
+                clipped = clipped_in_words(image)
+                encoded = encode(image.clamp_(0, 1))
+            with stages("write"):
+                for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
+                    if output.suffix == ".jpg":
+                        write_image(output, encoded)
+                    else:
+                        write_image(output, image if self.linear else encoded, bits=16)
+            done["developed"] += 1
+            tell(
+                place,
+                f"{path}: {image.shape[-1]} x {image.shape[-2]} px, {colors_in_words(raw, self.demosaic, balance)}",
+            )
+            tell("", f"{clipped}; wrote {paths[0]}")
+
+        try:
+            for_each_file(list(outputs), work)
+        finally:
+            missing = len(outputs) - sum(done.values())
+            tell("files", f"{done['developed']} developed, {done['kept']} kept, {missing} failed or left")
+            tell("time", stages.summary())
+
+
+def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
+    """Return the output paths of each file.
+
+    Raises:
+        ValueError: if two files would become the same picture, or a picture would replace one of the files.
+    """
+    outputs: dict[str, list[Path]] = {}
+    owners: dict[str, str] = {}
+    for path in dict.fromkeys(files):
+        stem = Path(path).stem
+        if stem in owners:
+            raise ValueError(f"{owners[stem]} and {path} would both become {folder / stem}{suffixes[0]}")
+        owners[stem] = path
+        outputs[path] = [folder / f"{stem}{suffix}" for suffix in suffixes]
+    taken = {Path(path).resolve() for path in files}
+    for output in (output for each in outputs.values() for output in each):
+        if output.resolve() in taken:
+            raise ValueError(f"cannot write {output}: it is an input")
+    return outputs
+
+
+def colors_in_words(raw: RawCapture, demosaic: str | None, balance: str | Tensor | None) -> str:
+    """Describe the colour matrix and the white balance of a picture."""
+    from kornia_tidy.lab.raw.color import ASSUMED_CAMERA
+    from kornia_tidy.lab.raw.develop import balance_factors, default_method, matrix_origin
+
+    if not raw.colors:
+        return "monochrome"
+    factors = balance_factors(raw, balance)
+    shown = " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, factors.tolist(), strict=True))
+    method = "no filter array" if raw.pattern is None else demosaic or default_method(raw)
+    matrix = {
+        "file": "the file's matrix",
+        "model": "LibRaw's matrix of the camera",
+        "assumed": f"no matrix: that of {ASSUMED_CAMERA} is assumed",
+    }[matrix_origin(raw)]
+    return f"{method}, white balance {shown}, {matrix}"
+
+
+def clipped_in_words(image: Tensor) -> str:
+    """Describe the share of a linear picture that a file of [0, 1] clips.
+
+    Example:
+        >>> import torch
+        >>> clipped_in_words(torch.tensor([[[-0.1, 0.5, 1.0, 1.2]]]))
+        '25 % of its values lie above white and 25 % below black, and are clipped'
+    """
+    above, below = (100 * float(share.float().mean()) for share in (image > 1, image < 0))
+    return f"{above:.3g} % of its values lie above white and {below:.3g} % below black, and are clipped"

@@ -1,0 +1,278 @@
+"""Settings that several commands have, under the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from kornia_tidy.reconstruction.settings import LensSettings
+from kornia_tidy.settings import Metres, Seed, Unit, one_of
+
+if TYPE_CHECKING:
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
+    from kornia_tidy.data.rgbd import Scene
+    from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
+    from kornia_tidy.optics.thin_lens import ThinLensCamera
+    from kornia_tidy.psf.psf_bank import PSFBank
+    from kornia_tidy.sensor.noise import SensorNoise
+
+File = Annotated[str, Unit("FILE")]
+Out = Annotated[str, Unit("OUT")]
+Folder = Annotated[str, Unit("FOLDER")]
+Noise = Annotated[float | str, Unit("S|FILE", "", 0)]
+Masks = Annotated[int | str, Unit("K|FILE", "", 1, 1024)]  # PSFs of more masks take days
+Window = Annotated[int, Unit("PX", "pixels", 1)]
+
+MASKS = 5  # in one exposure
+OF_SENSOR = ("measured", "sigma", "full_well", "bits")
+"""Settings of a system that --psfs and --noise say."""
+OF_MEASURED = (
+    "masks", "start", "mask_size", "design", "focal_length", "pixel_pitch", "depth_range", "f_number",
+    "aperture_diameter", "focus_distance", "window", "stray_light",
+)  # fmt: skip
+"""Settings of a camera that are measured with its PSFs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthFile:
+    """Depth file.
+
+    Metres are stored value * scale or, for the disparity of a stereo pair,
+    baseline * focal / (stored value * scale + doffs).
+
+    Args:
+        depth_scale: metres (or pixels of disparity) per stored unit; 0.001 for a 16-bit file in millimetres, 0.0002 for
+            TUM's 5000 units per metre.
+        depth_kind: what is stored.
+        invalid: stored values that mean 'unknown', such as inf. NaN and a stored integer 0 always do. Unknown pixels
+            take the depth of their nearest known neighbour. None: no others.
+        focal_px: for disparity: focal length of the stereo pair. None: unknown.
+        baseline_m: for disparity: distance between its cameras. None: unknown.
+        doffs_px: for disparity: offset of their principal points.
+    """
+
+    depth_scale: Annotated[float, Unit("S")] = 1.0
+    depth_kind: Annotated[str, one_of(("depth", "disparity"))] = "depth"
+    invalid: tuple[Annotated[float, Unit("VALUE", infinite=True)], ...] = ()
+    focal_px: Annotated[float, Unit("PX", "pixels")] | None = None
+    baseline_m: Metres | None = None
+    doffs_px: Annotated[float, Unit("PX", "pixels")] = 0.0
+
+    def read(self, image: str, depth: str) -> Scene:
+        """Read a picture with its depth."""
+        from kornia_tidy.data.rgbd import read_rgbd
+
+        return read_rgbd(
+            image,
+            depth,
+            scale=self.depth_scale,
+            kind=self.depth_kind,
+            invalid=self.invalid,
+            focal_px=self.focal_px,
+            baseline_m=self.baseline_m,
+            doffs_px=self.doffs_px,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnScene:
+    """Your own scene.
+
+    Args:
+        image: picture of a scene: PNG, JPEG, TIFF or NPY. None: a scene that is painted here.
+        depth: its depth: PNG, TIFF, PGM, PFM, NPY or OpenEXR. None: that of the painted scene.
+        file: how it is stored.
+    """
+
+    image: Annotated[str, Unit("IMAGE")] | None = None
+    depth: Annotated[str, Unit("DEPTH")] | None = None
+    file: DepthFile = field(default_factory=DepthFile)
+
+    def __post_init__(self) -> None:
+        if (self.image is None) != (self.depth is None):
+            raise ValueError("--image and --depth belong together: give both, or neither for a scene made here")
+
+    def read(self) -> Scene | None:
+        """Read the scene, if there is one."""
+        return None if self.image is None or self.depth is None else self.file.read(self.image, self.depth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneLens(LensSettings):
+    """Lens and sensor.
+
+    Args:
+        fit_depth: choose focus and aperture so that this scene's depths (its middle 99 %) fill psi = -20 to +20.
+    """
+
+    fit_depth: bool = False
+
+    def camera_for(self, scene: Scene | None) -> ThinLensCamera:
+        """Return the camera, or the one that fits the scene.
+
+        Raises:
+            ValueError: if ``--fit-depth`` comes with an option that it chooses, or no lens fits.
+        """
+        if not self.fit_depth:
+            return self.camera()
+        from kornia_tidy.data.depth_range import middle_depths
+
+        for name in ("f_number", "aperture_diameter", "focus_distance", "depth_range"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"--fit-depth chooses --{name.replace('_', '-')}: give one of the two")
+        if scene is None:
+            raise ValueError("--fit-depth needs a scene with a range of depths")
+        return replace(self, depth_range=middle_depths(scene.depth, scene.valid)).camera()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """Masks.
+
+    Args:
+        masks: number of masks of random height in one exposure, or a file of heights. None: 5.
+        mask_seed: seed of random heights. None: 0.
+        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances. None:
+            computed for lens and masks.
+        lens: of the camera.
+    """
+
+    lens: SceneLens = field(default_factory=SceneLens)
+    masks: Masks | None = None
+    mask_seed: Seed | None = None
+    psfs: File | None = None
+
+    def optics(self, scene: Scene | None, **options: Any) -> TiDyOptics:
+        """Return the camera: that which was measured, or one of lens and masks.
+
+        Args:
+            scene: for ``--fit-depth``, if there is one.
+            options: further ones of :class:`~kornia_tidy.TiDyOptics`.
+
+        Raises:
+            ValueError: if ``--psfs`` comes with an option for what was measured with them.
+        """
+        import torch
+
+        from kornia_tidy.camera.tidy_optics import TiDyOptics
+        from kornia_tidy.lab.mask_export.mask_files import read_heights
+        from kornia_tidy.masks.pixelwise import PixelwiseMask
+
+        if self.psfs is not None:
+            from kornia_tidy.lab.calibration.psf.measured_camera import measured_camera
+
+            of_lens = [name for name, value in vars(self.lens).items() if value != getattr(SceneLens(), name)]
+            given = [name for name in ("masks", "mask_seed") if getattr(self, name) is not None]
+            refuse_with_psfs([*of_lens, *given])
+            return measured_camera(self.psfs, **options)
+        if isinstance(self.masks, str):
+            if self.mask_seed is not None:
+                raise ValueError(
+                    "--mask-seed is of masks of random height, and --masks is a file: leave one of them out"
+                )
+            shown = PixelwiseMask(initial=read_heights(self.masks))
+        else:
+            generator = torch.Generator().manual_seed(self.mask_seed or 0)
+            shown = PixelwiseMask(MASKS if self.masks is None else self.masks, generator=generator)
+        return TiDyOptics(shown, camera=self.lens.camera_for(scene), **options)
+
+    def in_words(self, optics: TiDyOptics) -> str:
+        """Describe the masks of the camera."""
+        if self.psfs is not None:
+            return f"as they were when the PSFs of {self.psfs} were measured"
+        origin = self.masks if isinstance(self.masks, str) else f"noise of seed {self.mask_seed or 0}"
+        return f"{optics.masks.extra_repr()}, {origin}"
+
+
+def refuse_with_psfs(given: Iterable[str]) -> None:
+    """Raise ``ValueError`` if an option was given for what ``--psfs`` says: lens, masks and distances."""
+    for name in given:
+        raise ValueError(f"--psfs has a lens, masks and distances of its own: leave out --{name.replace('_', '-')}")
+
+
+def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTransfer | None]:
+    """Return the sensor of ``--noise``, and the calibration if it was measured; None for what was not given.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if the file holds no calibration of the noise.
+    """
+    if given is None:
+        return None, None
+    from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
+    from kornia_tidy.sensor.noise import SensorNoise
+
+    if not isinstance(given, str):
+        return SensorNoise(given), None
+    if not Path(given).exists():
+        raise FileNotFoundError(
+            f"--noise is a number, of full scale, or a file of raw calibrate-noise: there is no file {given:.80}"
+        )
+    measured = read_json(given)
+    return measured.sensor_noise(), measured
+
+
+def measured_system(psfs: str | None, noise: float | str | None, given: Iterable[str]) -> tuple[dict, PSFBank | None]:
+    """Return the settings of the camera that --psfs and --noise say, and the measured PSFs, if any.
+
+    Args:
+        psfs: file of measured PSFs.
+        noise: standard deviation of the read noise, or a file of its calibration.
+        given: names of the settings that were given otherwise.
+
+    Raises:
+        FileNotFoundError: if a file is not there.
+        ValueError: if a file is of another kind, or a setting was given that was measured with the PSFs.
+    """
+    from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+    from kornia_tidy.lab.measured import measured_settings, noise_settings
+
+    sensor, _ = read_noise(noise)
+    settings: dict[str, Any] = {} if sensor is None else noise_settings(sensor)
+    if psfs is None:
+        return settings, None
+    refuse_with_psfs(name for name in OF_MEASURED if name in given)
+    measured = MeasuredPSFs.load(psfs)
+    return {**settings, **measured_settings(measured)}, measured.bank
+
+
+def check_output(path: str, *inputs: str | None, bits: int = 8) -> None:
+    """Check before any work that a picture can be written to a path and does not replace an input.
+
+    Raises:
+        FileNotFoundError: if the folder does not exist.
+        ValueError: if the suffix is not a picture's, cannot hold the bits, or the file is an input.
+    """
+    from kornia_tidy.checks import check_choice
+    from kornia_tidy.data.image_files import SUFFIXES
+
+    suffix = Path(path).suffix.lower()
+    check_choice("the suffix of an image file", suffix, SUFFIXES)
+    check_choice(f"bits of a {suffix} file", bits, (8,) if suffix in {".jpg", ".jpeg"} else (8, 16))
+    check_outputs([path], inputs)
+
+
+def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None]) -> None:
+    """Check before any work that outputs can be written and do not replace inputs; None is skipped.
+
+    Raises:
+        FileNotFoundError: if a folder does not exist.
+        ValueError: if an output is a folder or an input.
+    """
+    from kornia_tidy.files import check_writable
+
+    there = [Path(other) for other in inputs if other is not None and Path(other).exists()]
+    for path in (Path(output) for output in outputs if output is not None):
+        check_writable(path)
+        if path.exists() and any(path.samefile(other) for other in there):
+            raise ValueError(f"cannot write {path}: it is an input")
+
+
+def check_folder(path: str | Path) -> Path:
+    """Return a folder to write into, or raise ``ValueError`` if something else has its name."""
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"cannot write into {folder}: it is not a folder")
+    return folder

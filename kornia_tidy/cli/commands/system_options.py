@@ -1,0 +1,68 @@
+"""The system that restores captures, where a command takes one: shipped, trained, or in closed form."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kornia_tidy.choices import PRETRAINED
+from kornia_tidy.files import read_bytes
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.reconstruction.pretrained import FOLDER
+
+if TYPE_CHECKING:
+    from kornia_tidy.reconstruction.trained import TrainedSystem
+    from kornia_tidy.sensor.noise import SensorNoise
+
+CLOSED_FORM = "wiener-bilateral"  # restores measured cameras where no network is named
+
+
+def head_file(head: str) -> Path:
+    """Return the file of a network, by the name of one that comes with the library or by its own.
+
+    Example:
+        >>> head_file("edof-5").name
+        'edof-5.safetensors'
+    """
+    if head in PRETRAINED:
+        return FOLDER / f"{head}.safetensors"
+    if head in CLOSED_FORMS:
+        raise ValueError(f"the closed form {head!r} needs the PSFs of a camera: give --psfs")
+    if not Path(head).exists():
+        raise FileNotFoundError(f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file {head}")
+    return Path(head)
+
+
+def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) -> TrainedSystem:
+    """Return the system that is named, behind the camera that was measured.
+
+    Args:
+        head: name of a shipped system or of a closed form, or a checkpoint. None: the closed form of measured PSFs.
+        psfs: file of measured PSFs.
+        sensor: measured noise. None: the system's own.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if neither a system nor PSFs are given, a file is of another kind, or the PSFs are not of the
+            system's lens and depths.
+    """
+    from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+    from kornia_tidy.lab.measured import closed_form_system, with_measurements
+    from kornia_tidy.reconstruction.trained import load_trained
+
+    if head is None and psfs is None:
+        raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, or --psfs")
+    measured = None if psfs is None else MeasuredPSFs.load(psfs)
+    if measured is not None and (head is None or head in CLOSED_FORMS):
+        return closed_form_system(measured, sensor, head or CLOSED_FORM)
+    assert head is not None
+    system = load_trained(head_file(head))
+    return system if measured is None and sensor is None else with_measurements(system, measured, sensor)
+
+
+def digests(head: str | None, *files: str | float | None) -> dict[str, Any]:
+    """Return what a system was made of, to recognise results of the same one: digests of files, and numbers."""
+    named = () if head is None or head in CLOSED_FORMS else (str(head_file(head)),)
+    read = [hashlib.sha256(read_bytes(f)).hexdigest() if isinstance(f, str) else f for f in (*named, *files)]
+    return {"head": head, "files": read}

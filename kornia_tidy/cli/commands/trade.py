@@ -1,0 +1,188 @@
+"""`kornia-tidy trade`: measurement of the speed-accuracy trade-off on one's own scene and device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from kornia_tidy.choices import KNOBS, Preset
+from kornia_tidy.cli.commands.shared import CameraSettings, Folder, OwnScene, check_folder
+from kornia_tidy.settings import Count, Pixels, Seed, Unit, one_of
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
+    from kornia_tidy.data.rgbd import Scene
+    from kornia_tidy.design.tradeoff.sweep_settings import Setting
+
+NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trade:
+    """Measure speed against accuracy.
+
+    The speed-accuracy trade-off is measured on one scene and this machine. Each setting of
+    the fidelity is varied alone from a preset. The presets, and the plans for this scene
+    within errors of 1e-1 to 1e-6, are measured too. For each point the table has the
+      error    of the noise-free capture in linear light, full scale 1, against the preset
+               'reference', which is rendered once
+      time     of a capture after a change of the masks (PSFs and rendering), and with
+               cached PSFs; median and interquartile range
+      memory   peak of the tensors of a capture
+
+    Args:
+        output: made if missing.
+        size: side of the scene made here.
+        seed: of the scene made here.
+        knobs: settings that are varied. None: all of them.
+        base: preset of the other settings.
+        reference: preset to which errors refer; balanced is faster on a large scene.
+        training: captures with gradients to the masks too.
+        repeats: timed runs of each.
+        device: cpu, cuda or cuda:N.
+        scene: that is captured.
+        camera: lens and masks.
+    """
+
+    output: Folder = "outputs/trade"
+    size: Pixels = 512
+    seed: Seed = 0
+    knobs: tuple[Annotated[str, one_of(KNOBS)], ...] = ()
+    base: Preset = "balanced"
+    reference: Preset = "reference"
+    training: bool = False
+    repeats: Count = 5
+    device: Annotated[str, Unit("DEVICE")] = "cpu"
+    scene: OwnScene = field(default_factory=OwnScene)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+
+    basic: ClassVar = (
+        *("output", "size", "seed", "knobs", "base", "reference", "training", "repeats", "device", "image", "depth"),
+        *("depth_scale", "masks", "depth_range", "f_number", "focus_distance", "fit_depth"),
+    )
+    notes: ClassVar = """\
+Results are written to FOLDER/trade.json and trade.csv after every point, and at the end a
+figure to trade.png and a table to the screen. After Ctrl-C the same command continues.
+Another scene, machine or version of the code starts anew.
+
+No setting can lower the error below that of the other settings. With an exact but slow
+base, --base reference, the error of each setting alone is measured.
+
+Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
+environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
+"""
+    examples: ClassVar = """\
+  kornia-tidy trade                                 all settings, on a generated scene
+
+  kornia-tidy trade --knobs window layers --training
+
+  kornia-tidy trade --image rgb.png --depth depth.png --depth-scale 0.001 --device cuda
+"""
+
+    def run(self) -> None:
+        """Measure the sweep, write files after every row, and print the table."""
+        folder = check_folder(self.output)
+        from kornia_tidy.cli.commands.report import progress_bar, scene_in_words, tell
+        from kornia_tidy.design.tradeoff.conditions import Conditions
+        from kornia_tidy.design.tradeoff.files import TradeRun, known_rows, markdown, rows_beside, write_trade
+        from kornia_tidy.design.tradeoff.measure import missing, sweep
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
+        from kornia_tidy.figures.tradeoff import draw_trade
+
+        require_matplotlib()
+        device = self._device()
+        scene = self._scene()
+        optics = self.camera.optics(scene).to(device)
+        image, depth = scene.image.to(device), scene.depth.to(device)
+        optics.check_scene(image, depth)  # warns once: the measured captures do not warn
+        name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
+        conditions = Conditions.here_and_now(name, optics, image, depth, self.reference)
+        settings = self._settings(optics, image, depth)
+        known, why = known_rows(folder, conditions)
+
+        tell("scene", f"{name}, {scene_in_words(scene)}")
+        tell("camera", optics.camera.extra_repr())
+        tell("masks", self.camera.in_words(optics))
+        tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
+        todo = len(missing(settings, known, self.repeats, self.training))
+        tell("settings", f"{len(settings)}, {todo} different ones to be measured{why}")
+        folder.mkdir(parents=True, exist_ok=True)
+
+        rows = []
+        steps = sweep(
+            optics,
+            image,
+            depth,
+            settings,
+            repeats=self.repeats,
+            training=self.training,
+            reference=self.reference,
+            known=known,
+        )
+        with progress_bar("trade", total=len(settings), unit="setting") as progress:
+            try:
+                for setting in settings:
+                    step = f"{setting.knob} {setting.value}"
+                    progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
+                    rows.append(next(steps))
+                    write_trade(folder, TradeRun(conditions, (*rows, *rows_beside(known, rows))))
+                    progress.update()
+            except KeyboardInterrupt:
+                progress.close()
+                tell(
+                    "stopped",
+                    f"{len(rows)} of {len(settings)} settings are written; the same command goes on from there",
+                )
+                raise
+
+        shown = TradeRun(conditions, tuple(rows))
+        save_figure(folder / "trade.png", draw_trade(shown))
+        print(f"\n{markdown(rows)}\n")
+        tell("bold", "no other setting is both faster and closer to the reference")
+        tell("wrote", f"{folder / 'trade.png'}: look at this one")
+        for other in ("trade.json", "trade.csv"):
+            tell("", str(folder / other))
+
+    def _device(self) -> torch.device:
+        """Return the device, or raise an error before any work."""
+        import torch
+
+        from kornia_tidy.checks import check_choice
+        from kornia_tidy.design.tradeoff.costs import DEVICES
+
+        check_choice("--device", self.device.partition(":")[0], DEVICES)
+        if self.device.startswith("cuda") and not torch.cuda.is_available():
+            raise ValueError(f"--device {self.device}: PyTorch finds no CUDA GPU here")
+        try:
+            return torch.device(self.device)
+        except RuntimeError:
+            raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
+
+    def _scene(self) -> Scene:
+        import torch
+
+        from kornia_tidy.data.dead_leaves import dead_leaves
+        from kornia_tidy.data.rgbd import Scene
+
+        if (scene := self.scene.read()) is not None:
+            return scene
+        image, depth = dead_leaves(self.size, self.size, depth_range=(NEAR, FAR), seed=self.seed)
+        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
+    def _settings(self, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
+        """Return the points of the sweep and the plans, without windows wider than the border allows."""
+        from kornia_tidy.design.tradeoff.measure import linear_light
+        from kornia_tidy.design.tradeoff.sweep_settings import PLAN, planned, sweep_settings
+        from kornia_tidy.render.borders import largest_window
+
+        knobs = self.knobs or KNOBS
+        widest = largest_window(optics.border, *image.shape[-2:])
+        steps = sweep_settings(self.base, [knob for knob in knobs if knob != PLAN])
+        settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
+        if PLAN in knobs:
+            settings += planned(optics, linear_light(optics, image)[None], depth[None])
+        return settings

@@ -1,0 +1,190 @@
+"""Task of a co-design: the scene, lens, sensor and modulator that are given, and the weight of depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from kornia_tidy.checks import check_metres, check_part, check_positive
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
+from kornia_tidy.sensor.noise import SensorNoise
+
+MOST_MASKS = 64
+LARGEST_MASK = 1024  # pixels along a side: a search with more would take days
+SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
+_PER_FOCAL_LENGTH = 1.22 * 2  # Airy disc: diameter / (wavelength * f-number)
+
+
+@dataclass(frozen=True)
+class DesignTask:
+    """Given quantities of a co-design of aperture, focus and masks. Lengths in metres, light in electrons.
+
+    Args:
+        depth_range: nearest and farthest depth. The farthest may be ``inf``.
+        focal_length: of the lens.
+        pixel_pitch: of the sensor.
+        electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number, but
+            for those at which white would exceed the full well: there it is shorter.
+        reference_f_number: f-number at which the electrons were counted.
+        read_noise_electrons: standard deviation.
+        masks: number K of masks in one exposure.
+        modulator: shows the masks, with its switching, levels and losses. Default: equal dwell times without delay.
+            The flat lens, to which masks are compared, has none.
+        statistics: of the scenes: power spectrum, light, and the distribution of inverse depth over the range.
+        depth_weight: share of depth in what matters: 0 is the image alone, 1 depth alone.
+        mask_size: pixels along a side of a mask.
+        full_well_electrons: capacity of a pixel. Default: that of a common pixel of this pitch, see
+            :func:`kornia_tidy.sensor.full_well_of`.
+
+    Raises:
+        ValueError: if a value is out of its range, a length is not in metres, or nothing is out of focus.
+        TypeError: if a part is of another type.
+
+    Example:
+        >>> task = DesignTask(depth_range=(0.3, 10.0), electrons=10_000)
+        >>> round(task.balanced_f_number)
+        56
+        >>> DesignTask(focal_length=50)
+        Traceback (most recent call last):
+        ValueError: focal_length must be metres between 1e-05 and 10 (50 mm is 50e-3), got 50
+    """
+
+    depth_range: tuple[float, float] = (0.2975, math.inf)
+    focal_length: float = 50e-3
+    pixel_pitch: float = 8e-6
+    electrons: float = 57_000
+    reference_f_number: float = 17.6
+    read_noise_electrons: float = 2.4
+    masks: int = 5
+    modulator: nn.Module = field(default_factory=DwellTimes)
+    statistics: SceneStatistics = PHOTOGRAPHS
+    depth_weight: float = 0.0
+    mask_size: int = 23
+    full_well_electrons: float | None = None
+
+    def __post_init__(self) -> None:
+        check_metres("focal_length", self.focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+        check_metres("pixel_pitch", self.pixel_pitch, *PITCHES, "8 um is 8e-6")
+        check_part("modulator", self.modulator, nn.Module, "a modulator such as DwellTimes()")
+        check_part("statistics", self.statistics, SceneStatistics, "SceneStatistics such as PHOTOGRAPHS")
+        if not isinstance(self.masks, int) or not 1 <= self.masks <= MOST_MASKS:
+            raise ValueError(f"masks must be a whole number from 1 to {MOST_MASKS}, got {self.masks}")
+        if not isinstance(self.mask_size, int) or not 1 <= self.mask_size <= LARGEST_MASK:
+            raise ValueError(f"mask_size must be a whole number from 1 to {LARGEST_MASK}, got {self.mask_size}")
+        timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
+        if not 0 <= self.depth_weight <= 1:
+            raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")
+        if self.full_well_electrons is not None:
+            check_positive("full_well_electrons", self.full_well_electrons)
+        self.sensor(self.reference_f_number)  # refuses light and noise out of range
+        self.camera(max(self.reference_f_number, FASTEST), 0.5)  # and depths out of order
+        near, far = self.depth_range
+        if near <= 2 * self.focal_length:
+            raise ValueError(
+                f"depth_range must begin beyond two focal lengths, {2 * self.focal_length:g} m, got {near:g} m"
+            )
+        if self.balanced_f_number < SLOWEST_LENS:
+            raise ValueError(
+                f"depths from {near:g} to {far:g} m are all in focus with a lens of {self.focal_length:g} m at "
+                f"f/{self.balanced_f_number:.2g}: if they are millimetres, multiply them by 0.001"
+            )
+
+    @property
+    def balanced_f_number(self) -> float:
+        r"""F-number at which the geometric blur at the ends of the depth range is as wide as the Airy disc.
+
+        .. math:: N = \sqrt{\frac{f^2 \Delta}{2.44 \lambda}}
+
+        with half the range of inverse depth :math:`\Delta`, focus in its middle.
+
+        Source: Goodman, Introduction to Fourier Optics, section 6.4, for the blur; Hecht, Optics, for the Airy disc.
+        """
+        near, far = self.depth_range
+        half = (1 / near - 1 / far) / 2
+        return self.focal_length * math.sqrt(half / (_PER_FOCAL_LENGTH * REFERENCE_WAVELENGTH))
+
+    def f_numbers(self) -> tuple[float, ...]:
+        """Return the coarse grid of f-numbers: from four stops wider to one stop slower than balanced, a stop apart.
+
+        A stop is a factor of sqrt 2, which halves the light.
+        """
+        steps = [self.balanced_f_number * 2 ** (step / 2) for step in range(-4, 2)]
+        return tuple(f_number for f_number in steps if f_number >= FASTEST)
+
+    def camera(self, f_number: float, focus: float) -> ThinLensCamera:
+        """Return the lens at an f-number.
+
+        Args:
+            f_number: focal length over aperture diameter.
+            focus: in focus, as a fraction of the range of inverse depth from the far end (0) to the near end (1).
+        """
+        near, far = self.depth_range
+        inverse = 1 / far + focus * (1 / near - 1 / far)
+        distance = math.inf if inverse == 0 else 1 / inverse
+        return ThinLensCamera(
+            self.focal_length, self.focal_length / f_number, distance, self.pixel_pitch, self.depth_range
+        )
+
+    def sensor(self, f_number: float) -> SensorNoise:
+        """Return the sensor, with the light that the f-number admits. See :func:`exposed_sensor`."""
+        light = self.electrons, self.reference_f_number, self.read_noise_electrons
+        return exposed_sensor(f_number, *light, self.full_well)
+
+    @property
+    def full_well(self) -> float:
+        """Capacity of a pixel in electrons."""
+        return full_well_of(self.pixel_pitch) if self.full_well_electrons is None else self.full_well_electrons
+
+    @property
+    def saturating_f_number(self) -> float:
+        """F-number at which white just fills the well; at wider apertures the exposure is shorter."""
+        return self.reference_f_number * math.sqrt(self.electrons / self.full_well)
+
+    def noise(self, f_number: float) -> float:
+        """Return the standard deviation of the noise at the scenes' mean light, full scale 1."""
+        return float(self.sensor(f_number).std(torch.tensor(self.statistics.mean, dtype=torch.float64)))
+
+    def lens(
+        self, masks: PixelwiseMask | None, f_number: float, focus: float, fidelity: Fidelity, spectrum: Spectrum
+    ) -> PSFModel:
+        """Return the lens with masks in its pupil, or the flat lens for None."""
+        camera = self.camera(f_number, focus)
+        if masks is None:
+            return PSFModel(flat_mask(self.mask_size), camera, DwellTimes(), fidelity, spectrum)
+        return PSFModel(masks, camera, self.modulator, fidelity, spectrum)
+
+    def search_window(self, f_number: float, focus: float) -> int:
+        """Return the side of the PSFs during the search, in pixels: the widest blur disc, half as much again, odd."""
+        camera = self.camera(f_number, focus)
+        image_distance = float(camera.image_distance)
+        step = self.pixel_pitch * camera.aperture_radius / image_distance
+        disc = 2 * max(map(abs, camera.defocus_range)) * REFERENCE_WAVELENGTH / (math.pi * step)
+        airy = _PER_FOCAL_LENGTH * REFERENCE_WAVELENGTH * image_distance / camera.aperture_diameter / self.pixel_pitch
+        return 2 * round(min(max(1.3 * disc + 2 * airy + 8, 33), 129) / 2) + 1
+
+
+def flat_mask(size: int = 23) -> PixelwiseMask:
+    """Return the mask of a plain lens: no phase at all."""
+    return PixelwiseMask(1, size, initial="flat")
+
+
+def mask_of(phase: Tensor) -> PixelwiseMask:
+    """Return pixel-wise masks of a phase in radians at 530 nm, (K, N, N).
+
+    Example:
+        >>> mask_of(torch.ones(2, 23, 23)).phase.shape
+        torch.Size([2, 23, 23])
+    """
+    masks = PixelwiseMask(len(phase), (phase.shape[-2], phase.shape[-1]), initial="flat")
+    masks.phase.data.copy_(phase)
+    return masks

@@ -1,0 +1,133 @@
+"""Properties of a raw capture, in words and as plain values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
+
+FLIPS = {
+    0: "is upright",
+    1: "is mirrored left to right",
+    2: "is mirrored top to bottom",
+    3: "is to be turned by 180 degrees",
+    4: "is mirrored at its diagonal",
+    5: "is to be turned by 90 degrees counter-clockwise",
+    6: "is to be turned by 90 degrees clockwise",
+    7: "is mirrored at its other diagonal",
+}
+
+
+def raw_in_words(raw: RawCapture) -> list[tuple[str, str]]:
+    """Return the properties of a capture as topics and texts.
+
+    Example:
+        >>> import torch
+        >>> counts = torch.tensor([[[64, 164], [264, 1023]]])
+        >>> for line in raw_in_words(RawCapture.from_counts(counts, "RGGB", 64, 1023)):
+        ...     print(*line)
+        camera unknown
+        exposure unknown
+        sensor 2 x 2 px, filter array RGGB
+        levels black 64, white 1023; counts 64 to 1023, 25 % of them at white or above
+        colour white balance unknown; no colour matrix
+        picture is upright
+    """
+    height, width = raw.counts.shape[-2:]
+    linear = f"linear {raw.colors}" if raw.colors else "monochrome"
+    colour = f"filter array {raw.pattern_letters}" if raw.pattern else linear
+    low, high = (end.item() for end in raw.counts.aminmax())
+    ignored = ", ".join(raw.info.ignored_opcodes)
+    matrices = [name for name in ("xyz_to_camera", "camera_to_srgb") if getattr(raw, name) is not None]
+    aspect = "" if raw.pixel_aspect == 1 else f"; its pixels are {raw.pixel_aspect:.4g} times as wide as high"
+    return [
+        ("camera", ", ".join(part for part in (raw.info.camera, raw.info.lens) if part) or "unknown"),
+        ("exposure", _exposure(raw.info) or "unknown"),
+        ("sensor", f"{width} x {height} px, {colour}"),
+        (
+            "levels",
+            f"black {_levels(raw.black)}, white {raw.white:g}; counts {low:.7g} to {high:.7g}, "
+            f"{100 * _saturated(raw):.3g} % of them at white or above",
+        ),
+        ("colour", f"white balance {_balance(raw)}; {' and '.join(matrices) or 'no colour matrix'}"),
+        ("picture", FLIPS[raw.flip] + aspect),
+        *([("opcodes", f"{ignored}: not applied")] if ignored else []),
+    ]
+
+
+def raw_properties(raw: RawCapture) -> dict[str, Any]:
+    """Return the properties of a capture as plain values, in SI units, with None for missing ones.
+
+    Example:
+        >>> import torch
+        >>> raw_properties(RawCapture.from_counts(torch.full((1, 2, 4), 64), "RGGB", 64, 1023))["width"]
+        4
+    """
+
+    def plain(tensor: Tensor | None) -> list[Any] | None:
+        return None if tensor is None else tensor.tolist()
+
+    info = raw.info
+    channels, height, width = raw.counts.shape
+    low, high = (end.item() for end in raw.counts.aminmax())
+    return {
+        "make": info.make,
+        "model": info.model,
+        "lens": info.lens,
+        "iso": info.iso,
+        "exposure": info.exposure,
+        "aperture": info.aperture,
+        "focal_length": info.focal_length,
+        "noise_profile": info.noise_profile,
+        "timestamp": info.timestamp.isoformat() if info.timestamp else None,
+        "ignored_opcodes": info.ignored_opcodes,
+        "width": width,
+        "height": height,
+        "channels": channels,
+        "pattern": raw.pattern_letters,
+        "colors": raw.colors,
+        "black": raw.black.tolist(),
+        "white": raw.white,
+        "counts": [low, high],
+        "saturated": _saturated(raw),
+        "white_balance": plain(raw.white_balance),
+        "daylight_balance": plain(raw.daylight_balance),
+        "xyz_to_camera": plain(raw.xyz_to_camera),
+        "camera_to_srgb": plain(raw.camera_to_srgb),
+        "flip": raw.flip,
+        "pixel_aspect": raw.pixel_aspect,
+    }
+
+
+def _exposure(info: RawInfo) -> str:
+    parts = []
+    if info.exposure:
+        short = info.exposure < 0.3
+        parts.append(f"1/{1 / info.exposure:.0f} s" if short else f"{info.exposure:.3g} s")
+    if info.aperture:
+        parts.append(f"f/{info.aperture:.2g}")
+    if info.focal_length:
+        parts.append(f"{info.focal_length * 1e3:.3g} mm")
+    if info.iso:
+        parts.append(f"ISO {info.iso:.0f}")
+    if info.timestamp:
+        parts.append(str(info.timestamp))
+    return ", ".join(parts)
+
+
+def _levels(black: Tensor) -> str:
+    """Format black levels: one number if all are equal, else one for each place of the tile."""
+    levels = black.flatten().tolist()
+    return f"{levels[0]:g}" if len(set(levels)) == 1 else " ".join(f"{level:g}" for level in levels)
+
+
+def _saturated(raw: RawCapture) -> float:
+    return float((raw.counts >= raw.white).float().mean())
+
+
+def _balance(raw: RawCapture) -> str:
+    if raw.white_balance is None:
+        return "unknown"
+    return " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, raw.white_balance.tolist(), strict=True))

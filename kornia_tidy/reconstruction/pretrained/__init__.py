@@ -1,0 +1,105 @@
+"""Small trained systems that are shipped with the package.
+
+``heads.json`` holds how each was trained, and its scores on test scenes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from kornia_tidy.checks import check_choice
+from kornia_tidy.choices import PRETRAINED
+from kornia_tidy.reconstruction.eight_bits import in_eight_bits
+from kornia_tidy.reconstruction.settings import SystemSettings
+from kornia_tidy.reconstruction.state_file import read_state, write_state
+from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
+
+FOLDER = Path(__file__).parent
+
+
+def load_pretrained(name: str) -> TrainedSystem:
+    """Load a shipped system, a camera and a network trained together.
+
+    Args:
+        name: one of :data:`PRETRAINED`.
+
+    Returns:
+        The system in eval mode, on the CPU. Its network takes captures of its camera, (B, 3, H, W) as
+        :class:`~kornia_tidy.TiDyOptics` returns them, with a noise of 0.002 of full scale, and returns the maps of its
+        task; :func:`~kornia_tidy.reconstruction.tasks.split_maps` returns them by name.
+
+    Raises:
+        ValueError: if there is no system of this name.
+
+    Example:
+        >>> import torch
+        >>> system = load_pretrained("edof-5")
+        >>> image, depth = torch.rand(1, 3, 72, 72), torch.full((1, 1, 72, 72), 1.0)
+        >>> with torch.no_grad():
+        ...     estimate = system.head(system.optics(image, depth))
+        >>> estimate.shape
+        torch.Size([1, 3, 72, 72])
+    """
+    check_choice("name", name, PRETRAINED)
+    return load_trained(FOLDER / f"{name}.safetensors")
+
+
+def pretrained_settings(name: str) -> SystemSettings:
+    """Return the settings of camera and network of a shipped system, without building them.
+
+    Example:
+        >>> pretrained_settings("joint-1").masks
+        1
+    """
+    check_choice("name", name, PRETRAINED)
+    known, _ = SystemSettings.split(read_state(FOLDER / f"{name}.safetensors")["settings"])
+    return SystemSettings(**known)
+
+
+def about_pretrained() -> dict[str, Any]:
+    """Return settings, steps, machine, date and scores of the shipped systems."""
+    return json.loads((FOLDER / "heads.json").read_text())
+
+
+def pretrained_record(name: str) -> dict[str, Any]:
+    """Return the record of the training of a shipped system: seed, scores by test set, machine and date.
+
+    Example:
+        >>> sorted(pretrained_record("edof-5")["scores"])
+        ['dead leaves', 'real scenes']
+    """
+    check_choice("name", name, PRETRAINED)
+    about = about_pretrained()
+    return {**{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}, **about["systems"][name]}
+
+
+def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, short: bool = True) -> None:
+    """Write a checkpoint for shipping: without the state of the run, the network's weights in eight bits.
+
+    PSFs of a closed form are left out: :func:`~kornia_tidy.reconstruction.trained.load_trained` computes them anew. So
+    is the folder of the data, a place on one machine.
+
+    Args:
+        checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
+        path: of the new file.
+        short: write the network's weights as :func:`~kornia_tidy.reconstruction.eight_bits.in_eight_bits` rounds them.
+            They are loaded as float32. False: they stay as they are.
+
+    Raises:
+        ValueError: if it is no checkpoint, has no moving average, or a weight is not finite or too large.
+    """
+    state = read_state(checkpoint)
+    wanted = ("optics.", "average.network.")
+    weights = {name: value for name, value in state["state_dict"].items() if name.startswith(wanted)}
+    if not any(name.startswith(wanted[1]) for name in weights):
+        raise ValueError(f"{checkpoint} holds no moving average of its network: train it with ema above 0")
+    if short:
+        parameters = load_trained(checkpoint).head.named_parameters()
+        weights = in_eight_bits(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
+    weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
+    settings = {name: None if name == "root" else value for name, value in state["settings"].items()}
+    kept = {name: state[name] for name in ("global_step", "psfs") if name in state}
+    write_state(path, {"settings": settings, "state_dict": weights, **kept})

@@ -1,0 +1,344 @@
+"""Published systems: values against their sources, expected physics, and the cameras built from them."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.camera.published_systems import cubic_in_zernikes
+from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.design.fisher_information import crlb
+from kornia_tidy.figures.system_statistics import contrast_transfer
+from kornia_tidy.masks import CubicMask, RadialMask, ZernikeMask
+from kornia_tidy.optics import SYSTEMS, published_system
+from kornia_tidy.psf import AliasingWarning
+from kornia_tidy.reconstruction.tasks import metres
+from tests.base import BaseTester, shared
+from tests.scenes import load_scene
+
+NAMES = list(SYSTEMS)
+GATHERING = [name for name in NAMES if SYSTEMS[name].compositing == "gather"]
+HIDING = [name for name in NAMES if SYSTEMS[name].compositing == "occlusion"]
+
+
+def preset(name, **overrides):
+    return TiDyOptics.from_preset(name, generator=torch.Generator().manual_seed(0), **overrides)
+
+
+def psfs(optics, defocus):
+    with torch.no_grad():
+        return optics.psf_bank(defocus=defocus).psfs
+
+
+def sharpest(optics, defocus, channel=1):
+    """Return the defocus at which the peak of the PSF is highest."""
+    return defocus[int(psfs(optics, defocus)[:, channel].amax((1, 2)).argmax())]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Return an image and its normalised inverse depth: a real scene if it is available, else dead leaves."""
+    try:
+        image, depth, _ = load_scene("middlebury-motorcycle")
+    except pytest.skip.Exception:
+        image, depth = dead_leaves(200, 300, depth_range=(2.0, 4.5), seed=0)
+    image, inverse = image[:, 100:200, 120:264], 1 / depth[:, 100:200, 120:264]
+    return image, (inverse - inverse.min()) / (inverse.max() - inverse.min())
+
+
+class TestSources(BaseTester):
+    """The table against numbers of the sources, which are written out here again."""
+
+    @pytest.mark.parametrize(
+        ("name", "focal_length", "f_number", "focus", "pitch", "depths"),
+        [
+            ("phasecam3d", 50e-3, 17.64, 0.85, 7.36e-6, (0.496, 2.969)),
+            ("ikoma2021", 50e-3, 6.3, 1.7, 6.45e-6, (1.0, 5.0)),
+            ("sitzmann2018", 34.28e-3, 6.852, 1.0, 3.69e-6, (0.5, 1000.0)),
+            ("tidy-5", 50e-3, 17.65, 0.595, 7.56e-6, (0.2975, math.inf)),
+        ],
+    )
+    def test_feature_lenses(self, name, focal_length, f_number, focus, pitch, depths):
+        camera = SYSTEMS[name].camera()
+        assert camera.focal_length == pytest.approx(focal_length, rel=1e-3)
+        assert camera.f_number == pytest.approx(f_number, rel=1e-3)
+        assert camera.focus_distance == pytest.approx(focus, rel=1e-9)
+        assert camera.pixel_pitch == pytest.approx(pitch, rel=1e-3)
+        assert camera.depth_range == pytest.approx(depths, rel=1e-3)
+
+    @pytest.mark.parametrize(
+        ("name", "lo", "hi"),
+        [
+            ("tidy-5", -20.0, 20.0),
+            ("tidy-1", -20.0, 20.0),
+            ("fresnel", -20.0, 20.0),
+            ("phasecam3d", -10.0, 10.0),
+            ("ikoma2021", -36.24, 38.43),  # pi (50 mm / 12.6)^2 / 530 nm * (1/z - 1/1.7) at 5 and 1 m
+        ],
+    )
+    def test_feature_ranges_of_defocus(self, name, lo, hi):
+        assert SYSTEMS[name].camera().defocus_range == pytest.approx((lo, hi), abs=5e-3)
+
+    def test_feature_colours_noise_and_compositing(self):
+        nanometres = {name: tuple(round(w * 1e9) for w in s.spectrum.wavelengths) for name, s in SYSTEMS.items()}
+        assert nanometres["tidy-5"] == nanometres["phasecam3d"] == (610, 530, 470)
+        assert nanometres["ikoma2021"] == (632, 550, 450)
+        assert nanometres["sitzmann2018"] == (640, 550, 460)
+        sigmas = {name: preset(name).sensor.sigma for name in ("phasecam3d", "ikoma2021", "sitzmann2018")}
+        assert sigmas == {"phasecam3d": 0.01, "ikoma2021": 0.003, "sitzmann2018": 0.0105}
+        assert set(HIDING) == {"ikoma2021", "liu2022-pixelwise", "liu2022-spiral"}
+        material = preset("sitzmann2018").masks.material
+        assert [round(material.index(w * 1e-9), 6) for w in (460, 550, 640)] == [1.499, 1.493, 1.488]
+
+    def test_feature_masks(self):
+        assert {name: tuple(preset(name).masks.phase.shape) for name in ("tidy-5", "tidy-1", "phasecam3d")} == {
+            "tidy-5": (5, 23, 23),
+            "tidy-1": (1, 23, 23),
+            "phasecam3d": (1, 23, 23),
+        }
+        heights = preset("tidy-5").masks.heights().detach()
+        assert 0 <= float(heights.min()) < 1e-8
+        assert 1.19e-6 < float(heights.max()) <= 1.2e-6
+        modes = {name: preset(name).masks.coefficients.shape[1] for name in ("phasecam3d", "sitzmann2018")}
+        assert modes == {"phasecam3d": 55, "sitzmann2018": 350}
+
+    def test_convention_a_guess_says_so_first(self):
+        for system in SYSTEMS.values():
+            assert {"compositing", "noise", "wavelengths", "masks", "index", "pixels"} <= set(system.sources)
+            for name, source in system.sources.items():
+                assert ": " in source or name in ("start", "index", "pixels"), (system.name, name)
+                assert ("guess" in source) == source.startswith("guess: "), (system.name, name)
+        assert SYSTEMS["ikoma2021"].guesses == ("start",)
+        assert "focal length" in SYSTEMS["chang2019"].guesses
+
+    def test_feature_the_paper_fidelity_is_the_published_system(self):
+        """PSFs against NumPy: a 23-point pupil, FFTs of 31, 27 and 23 points, cropped to 23."""
+        with pytest.warns(AliasingWarning):
+            optics = preset("tidy-5", fidelity="paper", camera=DefocusRange(-20, 20))
+        assert optics.defocus_nodes == pytest.approx(np.linspace(-20, 20, 21), abs=1e-12)
+        assert (optics.compositing, optics.color_space, optics.fidelity.correlate) == ("gather", "paper", True)
+        x = np.linspace(-1.1, 1.1, 23)
+        rho2 = x[:, None] ** 2 + x**2
+        heights = optics.masks.heights().detach().double().numpy()
+        bank = psfs(optics, [-14.0, 0.0, 6.0]).double().numpy()
+        for channel, (size, wavelength) in enumerate(((31, 610e-9), (27, 530e-9), (23, 470e-9))):
+            for d, psi in enumerate((-14.0, 0.0, 6.0)):
+                angle = 2 * np.pi / wavelength * 0.5 * heights + psi * rho2 * 530e-9 / wavelength
+                field = np.where(rho2 <= 1 + 1e-9, np.exp(1j * angle), 0)
+                light = np.abs(np.fft.fftshift(np.fft.fft2(field, (size, size)), (1, 2))) ** 2
+                margin = (size - 23) // 2
+                light = light[:, margin : margin + 23, margin : margin + 23].mean(0) / (size**2 * 317)
+                assert abs(light - bank[d, channel]).max() < 1e-6 * light.max()
+
+    def test_feature_honest_and_published_psfs_agree_in_size(self):
+        """At defocus where the published grid does not alias, both have the same PSFs at the same scale."""
+        balanced = psfs(preset("phasecam3d", fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
+        paper = psfs(preset("phasecam3d", fidelity="paper"), [-5.0, 0.0, 5.0])
+        likeness = torch.nn.functional.cosine_similarity(balanced.flatten(2), paper.flatten(2), dim=2)
+        assert float(likeness.min()) > 0.97
+        camera = SYSTEMS["phasecam3d"].camera().resized(0.9)  # pixels 11 % too large
+        off = psfs(preset("phasecam3d", camera=camera, fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
+        worse = torch.nn.functional.cosine_similarity(off.flatten(2), paper.flatten(2), dim=2)
+        assert bool((worse < likeness).all())
+
+
+class TestPhysics(BaseTester):
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_a_psf_holds_no_more_light_than_there_is(self, name):
+        optics = preset(name)
+        with torch.no_grad():
+            bank = optics.psf_bank(defocus=optics.camera.defocus_range)
+        assert float(bank.energy.min()) > 0.75
+        assert float(bank.energy.max()) <= 1 + 1e-6
+        assert float(bank.psfs.min()) >= 0
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_white_stays_white(self, name):
+        optics = preset(name, sensor=None)
+        inverse_depth = torch.where(torch.arange(44) < 20, 0.9, 0.1) + 0.1 * torch.rand(1, 1, 40, 44)
+        with torch.no_grad():
+            white = optics(torch.ones(1, 3, 40, 44), metres(optics.camera, inverse_depth))
+        assert float((white - 1).abs().max()) < (1e-6 if name in GATHERING else 2e-5)
+
+    @pytest.mark.parametrize("name", GATHERING)
+    def test_feature_scatter_conserves_flux(self, name):
+        optics = preset(name, sensor=None, compositing="scatter", border="circular", color_space="linear")
+        image, inverse_depth = (
+            torch.rand(1, 3, 72, 72, dtype=torch.float64),
+            torch.rand(1, 1, 72, 72, dtype=torch.float64),
+        )
+        with torch.no_grad():
+            coded = optics(image, metres(optics.camera, inverse_depth))
+        self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-6, atol=0)
+
+    @pytest.mark.parametrize("name", ["tidy-1", "phasecam3d", "ikoma2021", "chang2019", "sitzmann2018"])
+    def test_feature_with_a_flat_mask_the_focus_is_sharpest(self, name):
+        optics = preset(name, masks=PixelwiseMask(1, 46 if SYSTEMS[name].smooth_iris else 23, "flat"))
+        expected = -optics.camera.chromatic_defocus(optics.spectrum.wavelengths[1])  # 0 but for singlets
+        assert sharpest(optics, [float(psi) for psi in range(-9, 10)]) == pytest.approx(expected, abs=0.5)
+
+    def test_feature_a_fresnel_lens_moves_each_colour_by_its_wavelength(self):
+        """Without wrapping all colours would have the same focus; the wrapped phase moves red to -11 and blue to -9."""
+        optics, nodes = preset("fresnel"), [float(psi) for psi in range(-20, 21)]
+        assert sharpest(optics, nodes) == -10
+        assert [sharpest(optics, nodes, channel) for channel in (0, 2)] == [-11, -9]
+
+    def test_feature_tidy_5_averages_what_tidy_1_shows_alone(self):
+        five, one = preset("tidy-5"), preset("tidy-1")
+        assert torch.equal(five.masks.phase[:1], one.masks.phase)
+        window = Fidelity(window=33, stray_light="discard")
+        alone = [preset("tidy-1", masks=PixelwiseMask(initial=h), fidelity=window) for h in five.masks.heights()]
+        mean = torch.stack([psfs(optics, [3.0]) for optics in alone]).mean(0)
+        self.assert_close(psfs(preset("tidy-5", fidelity=window), [3.0]), mean, rtol=0, atol=1e-7)
+
+    @torch.no_grad()
+    def test_feature_phasecam3d_starts_from_a_mask_that_tells_depth(self):
+        nodes = [float(psi) for psi in range(-10, 11)]
+        fisher = crlb(preset("phasecam3d"), nodes)
+        assert float(fisher.max() / fisher.min()) < 1.8  # nearly the same at every depth
+        noise = crlb(preset("phasecam3d", masks=PixelwiseMask(1)), nodes)
+        flat = crlb(preset("phasecam3d", masks=PixelwiseMask(1, initial="flat")), nodes)
+        assert float(noise.mean()) > 1.7 * float(fisher.mean())
+        assert float(flat.max()) > 10 * float(fisher.max())
+
+    @torch.no_grad()
+    def test_feature_the_fisher_mask_is_no_worse_than_the_published_one(self):
+        nodes = [float(psi) for psi in range(-10, 11)]
+        heights = torch.from_numpy(np.loadtxt(shared("data/masks/PhaseCam3D/FisherMask_HeightMap.txt")))
+        published = crlb(preset("phasecam3d", masks=PixelwiseMask(initial=heights)), nodes)
+        assert float(crlb(preset("phasecam3d"), nodes).mean()) < float(published.mean())
+
+    def test_feature_ikomas_psfs_are_round(self):
+        bank = psfs(preset("ikoma2021"), [-30.0, 0.0, 30.0])
+        self.assert_close(bank, bank.rot90(1, (2, 3)), rtol=0, atol=1e-7)
+        middle = bank.shape[-1] // 2
+        along, between = bank[..., middle, middle + 10], bank[..., middle + 6, middle + 8]
+        assert float((along - between).abs().mean()) < 0.1 * float(along.mean())
+
+    def test_feature_three_tenths_of_ikomas_light_see_no_mask(self):
+        window = Fidelity(window=33, stray_light="discard")
+        optics = preset("ikoma2021", fidelity=window)
+        mask = preset("ikoma2021", fidelity=window, modulator=None)
+        flat = preset("ikoma2021", fidelity=window, modulator=None, masks=RadialMask(1, 138, 61, "flat"))
+        expected = 0.7 * psfs(mask, [10.0]) + 0.3 * psfs(flat, [10.0])
+        self.assert_close(psfs(optics, [10.0]), expected, rtol=0, atol=1e-7)
+
+    def test_feature_changs_colours_are_sharp_where_the_glass_says(self):
+        """The power of a single lens goes as n - 1: PMMA has 1.49163, 1.49539, 1.49970 (610, 530, 470 nm)."""
+        optics, nodes = preset("chang2019"), [psi / 2 for psi in range(-46, 47)]
+        scale = math.pi * 3.125e-3**2 / 530e-9 / 50e-3
+        for channel, index in enumerate((1.49163, 1.49539, 1.49970)):
+            expected = scale * ((index - 1) / 0.49539 - 1)  # red is in focus farther away, blue nearer
+            assert sharpest(optics, nodes, channel) == pytest.approx(expected, abs=0.5)
+
+    def test_feature_lius_spiral_turns_with_depth_and_not_once_around(self):
+        optics = preset("liu2022-spiral")
+        nodes = [float(psi) for psi in range(-36, 37, 4)]
+        light = psfs(optics, nodes)[:, 1].double()
+        reach = torch.arange(light.shape[-1]) - light.shape[-1] // 2
+        lobe = light * (light > 0.3 * light.amax((1, 2), keepdim=True))
+        up, right = -(lobe * reach[:, None]).sum((1, 2)), (lobe * reach).sum((1, 2))
+        angle = np.unwrap(torch.atan2(up, right).numpy())
+        rotation = np.polyfit(nodes, angle, 1)[0]  # 13 rings: psi / 13, where psi is less at 550 nm than at 530 nm
+        assert rotation == pytest.approx(1 / 13, rel=0.06)
+        lo, hi = optics.camera.defocus_range
+        assert (hi - lo) / 13 < 2 * math.pi
+
+    def test_feature_sitzmanns_contrast_is_much_the_same_at_every_depth(self):
+        cubic = preset("sitzmann2018")
+        flat = preset("sitzmann2018", masks=ZernikeMask(1, 69, 350, "flat"))
+        nodes = [-36.0, -24.0, -12.0, 0.0, 12.0, 24.0, 36.0]
+        spreads = []
+        for optics in (cubic, flat):
+            contrast = contrast_transfer(psfs(optics, nodes))[:, 1, 4:12].mean(1)
+            spreads.append(float(contrast.std() / contrast.mean()))
+        assert spreads[0] < 0.05
+        assert spreads[1] > 1
+
+    def test_feature_the_cubic_in_zernikes_is_a_cubic_without_tilt(self):
+        phase = ZernikeMask(initial=cubic_in_zernikes(27.0, 55)).phase[0].detach()
+        x = torch.linspace(-1.1, 1.1, 23)
+        inside = x[:, None] ** 2 + x**2 <= 1
+        expected = CubicMask(27.0).phase[0].detach() - 0.75 * 27 * (x[:, None] + x)
+        self.assert_close(phase[inside], expected[inside], rtol=0, atol=1e-4)
+        optics = preset("sitzmann2018", fidelity=Fidelity(window=129))
+        light = psfs(optics, [0.0])[0, 1]
+        reach = torch.arange(129.0) - 64
+        assert abs(float((light * reach).sum())) < 1  # px
+
+
+class TestScenes(BaseTester):
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_all_capture_a_real_scene(self, name, scene):
+        image, inverse_depth = scene
+        optics = preset(name, color_space="linear", sensor=None)
+        with torch.no_grad():
+            light = optics(image, metres(optics.camera, inverse_depth))
+        assert optics.clamped_pixels == 0
+        assert light.shape == image.shape
+        assert float(light.mean()) == pytest.approx(float(image.mean()), rel=0.05)
+
+        def detail(picture):
+            return float(picture.diff(dim=-1).abs().mean() + picture.diff(dim=-2).abs().mean())
+
+        assert detail(light) < 0.9 * detail(image)
+        noisy = preset(name, color_space="linear")
+        with torch.no_grad():
+            coded = noisy(image, metres(noisy.camera, inverse_depth))
+        inside = (light > 0.1) & (light < 0.9)
+        assert float((coded - light)[inside].std()) == pytest.approx(SYSTEMS[name].sigma, rel=0.05)
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_gradients_reach_whatever_is_learnable(self, name):
+        optics = preset(name, sensor=None, fidelity=Fidelity(window=9, layer_spacing=20.0))
+        inverse_depth = torch.where(torch.arange(20) < 10, 0.8, 0.3).expand(1, 1, 20, 20)
+        coded = optics(torch.rand(1, 3, 20, 20), metres(optics.camera, inverse_depth))
+        assert coded.requires_grad == (name != "fresnel")
+        if name != "fresnel":
+            coded.square().mean().backward()
+            assert all(float(p.grad.abs().max()) > 0 for p in optics.masks.parameters())
+
+
+class TestFromPreset(BaseTester):
+    def test_exception_an_unknown_name_lists_those_there_are(self):
+        with pytest.raises(ValueError, match=r"must be one of 'tidy-5', 'tidy-1', .*'sitzmann2018', got 'tidy'"):
+            TiDyOptics.from_preset("tidy")
+
+    def test_exception_an_unknown_argument(self):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'mask'"):
+            preset("tidy-1", mask=None)
+
+    def test_exception_a_contradiction(self):
+        with pytest.raises(ValueError, match="fidelity 'paper' means"):
+            preset("ikoma2021", fidelity="paper")
+
+    @pytest.mark.parametrize("name", ["tidy-5", "tidy-1", "ikoma2021", "liu2022-pixelwise"])
+    def test_feature_a_seed_gives_the_same_masks_again(self, name):
+        first, again = preset(name).masks.phase, preset(name).masks.phase
+        other = TiDyOptics.from_preset(name, generator=torch.Generator().manual_seed(1)).masks.phase
+        assert torch.equal(first, again)
+        assert not torch.equal(first, other)
+
+    def test_feature_overrides_replace_parts_and_nothing_else(self):
+        optics = preset("ikoma2021", masks=PixelwiseMask(2, 30), sensor=None)
+        assert optics.pupil.amplitude.shape == (30, 30)  # the iris follows the mask's pixels
+        assert optics.sensor is None
+        assert (optics.compositing, optics.camera.focus_distance) == ("occlusion", 1.7)
+        assert preset("tidy-1", masks=None).masks.phase.shape == (1, 23, 23)
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_smoke_travels_to_workers(self, name):
+        optics = preset(name)
+        for other in (pickle.loads(pickle.dumps(optics)), copy.deepcopy(optics)):
+            assert torch.equal(other.masks.phase, optics.masks.phase)
+
+    def test_smoke_a_system_is_found_by_its_name(self):
+        assert all(published_system(name).name == name for name in NAMES)
+        assert len(NAMES) == 9
+        assert [SYSTEMS[name].year for name in NAMES] == [2023, 2023, 2023, 2019, 2021, 2019, 2022, 2022, 2018]

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from kornia_tidy.cli.command_line import main, read_command
+from tests.base import BaseTester
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class TestCommand(BaseTester):
+    def test_smoke_help_teaches(self, capsys):
+        with pytest.raises(SystemExit) as leaving:
+            main(["app", "--help"])
+        assert leaving.value.code == 0
+        told = capsys.readouterr().out
+        assert "pip install 'kornia-tidy[app]'" in told
+        assert "kornia-tidy app --port 8080" in told
+
+    @pytest.mark.parametrize("text", ["0", "80", "65536", "x", "-1", "8080.5", "9" * 400])
+    def test_exception_ports(self, text, capsys):
+        assert main(["app", f"--port={text}"]) == 2
+        assert "--port must be a whole number from 1024 to 65535, got" in capsys.readouterr().err
+
+    def test_feature_the_port_is_free_to_choose(self):
+        assert read_command(["app", "--port", "8080"]).port == 8080
+        assert read_command(["app"]).port is None
+
+    @pytest.mark.skipif(importlib.util.find_spec("gradio") is not None, reason="Gradio is installed")
+    def test_exception_without_gradio_the_remedy_is_told(self, capsys):
+        pytest.importorskip("matplotlib")
+        assert main(["app"]) == 2
+        assert "the app needs Gradio: pip install 'kornia-tidy[app]'" in capsys.readouterr().err
+
+
+class TestConstraints(BaseTester):
+    """Gradio 6.31 needs a Pillow below 13, which constraints.txt has."""
+
+    def pins(self, name):
+        lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+        return dict(re.fullmatch(r"([\w.-]+)==(\S+)", line).groups() for line in lines if line and line[0] != "#")
+
+    def test_feature_those_of_the_app_differ_in_pillow_alone(self):
+        usual, app = self.pins("constraints.txt"), self.pins("constraints-app.txt")
+        assert {"gradio", "torch", "kornia", "matplotlib"} <= set(app)
+        assert {name for name in usual if usual[name] != app.get(name, usual[name])} == {"pillow"}

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kornia_tidy.cli.app.scenes import chart, read_files
+from kornia_tidy.data import write_depth, write_image
+from tests.base import BaseTester
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A photo with two colours and a depth map in millimetres with a hole."""
+    image = torch.zeros(3, 60, 90)
+    image[0, :, :45], image[2, :, 45:] = 1.0, 1.0
+    depth = np.full((60, 90), 1500, np.uint16)
+    depth[:, 45:], depth[:10, :10] = 3000, 0
+    write_image(tmp_path / "photo.png", image)
+    np.save(tmp_path / "depth.npy", depth)
+    return tmp_path
+
+
+class TestChart(BaseTester):
+    def test_feature_five_strips_evenly_spaced_in_inverse_depth(self):
+        image, depth = chart(75, 100, (0.5, math.inf))
+        assert image.shape == (3, 75, 100)
+        self.assert_close(1 / depth[0, 0, ::20], torch.tensor([2.0, 1.5, 1.0, 0.5, 0.0]))
+        assert bool((depth == depth[:, :1]).all())
+
+    def test_feature_each_strip_has_light_and_dark(self):
+        image, _ = chart(75, 100)
+        for strip in image.split(20, -1):
+            assert float(strip.amin()) < 0.2
+            assert float(strip.amax()) > 0.7
+
+    def test_feature_strips_differ_in_depth_and_tint_alone(self):
+        image, _ = chart(60, 150)
+        dark = (image[0] < 0.5).split(30, -1)
+        assert all(torch.equal(dark[0], other) for other in dark[1:])
+
+
+class TestReadFiles(BaseTester):
+    def test_feature_smaller_files_stay_and_holes_are_marked(self, files):
+        scene = read_files(files / "photo.png", files / "depth.npy", 0.001, 96)
+        assert scene.image.shape == (3, 60, 90)
+        assert scene.depth.unique().tolist() == [1.5, 3.0]
+        assert int((~scene.valid).sum()) == 100
+
+    def test_feature_larger_files_are_made_smaller_without_mixing_depths(self, files):
+        scene = read_files(files / "photo.png", files / "depth.npy", 0.001, 30)
+        assert scene.image.shape == (3, 20, 30)
+        assert scene.depth.unique().tolist() == [1.5, 3.0]
+        assert scene.valid.dtype == torch.bool
+        assert not scene.valid[0, 0, 0]
+
+    def test_feature_a_grey_photo_becomes_rgb(self, files):
+        write_image(files / "grey.png", torch.rand(1, 60, 90))
+        assert read_files(files / "grey.png", files / "depth.npy", 0.001, 96).image.shape == (3, 60, 90)
+
+    def test_exception_another_size_names_both(self, files):
+        write_depth(files / "other.npy", torch.ones(1, 30, 45))
+        with pytest.raises(ValueError, match=r"must have the same size, got 90 x 60 and 45 x 30 pixels"):
+            read_files(files / "photo.png", files / "other.npy", 1.0, 96)
+
+    @pytest.mark.parametrize(("scale", "told"), [(1.0, "3e[+]03 m"), (1e-6, "0.003 m")])
+    def test_exception_a_wrong_unit(self, files, scale, told):
+        with pytest.raises(ValueError, match=rf"the middle depth of depth.npy would be {told}.*choose another unit"):
+            read_files(files / "photo.png", files / "depth.npy", scale, 96)

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import re
+import sys
+
+import pytest
+import torch
+
+from kornia_tidy.cli import main
+from kornia_tidy.cli.commands import demo
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.figures import demonstration
+from tests.base import BaseTester
+
+NAMES = {"demo.png", "reconstruction.png", "scene.png", "depth.png", "joint_depth.png"}
+NAMES |= {f"{camera}_{step}.png" for camera in ("coded", "joint") for step in ("capture", "closed_form", "network")}
+NAMES |= {"flat_capture.png", "flat_closed_form.png"}
+
+
+@pytest.fixture(autouse=True)
+def small_pages(monkeypatch):
+    monkeypatch.setattr(demonstration, "DOTS_PER_INCH", 40)
+
+
+class TestDemo(BaseTester):
+    @pytest.mark.takes_seconds
+    def test_feature_writes_the_pictures_again_and_again(self, tmp_path, capsys):
+        folder = tmp_path / "new" / "outputs"
+        runs = []
+        for _ in range(2):
+            assert main(["demo", "-o", str(folder), "--size", "80"]) == 0
+            told = capsys.readouterr().out
+            written = {path.name for path in folder.iterdir()}
+            assert all(str(folder / name) in told for name in written)
+            assert written - {"flat_network.png"} == NAMES
+            runs.append({name: read_image(folder / name) for name in NAMES})
+        assert runs[0]["demo.png"].shape == (3, 264, 480)
+        assert runs[0]["coded_capture.png"].shape == (3, 80, 80)
+        assert all(torch.equal(runs[0][name], runs[1][name]) for name in NAMES)
+
+    @pytest.mark.takes_seconds
+    def test_feature_tells_what_closed_forms_and_networks_gain_at_equal_light(self, tmp_path, capsys):
+        assert main(["demo", "-o", str(tmp_path), "--size", "128"]) == 0
+        told = {line[:9].strip(): line for line in capsys.readouterr().out.splitlines()}
+        numbers = {
+            name: [float(value) for value in re.findall(r"([\d.]+) dB", told[name])]
+            for name in ("coded", "flat", "joint")
+        }
+        for capture, *restored in numbers.values():
+            assert min(restored) > capture
+        gain = max(numbers["coded"][1:]) - max(numbers["flat"][1:])
+        assert float(re.search(r"([+-][\d.]+) dB", told["verdict"]).group(1)) == pytest.approx(gain, abs=0.15)
+        counts = re.findall(r"([\d,]+) electrons at f/([\d.]+)", told["light"])
+        (wide, fast), (narrow, slow) = [(float(n.replace(",", "")), float(f)) for n, f in counts]
+        assert wide / narrow == pytest.approx((slow / fast) ** 2, rel=0.06)  # of two digits each, 5 % at most
+        assert slow > fast
+
+    @pytest.mark.takes_seconds
+    def test_feature_a_scene_of_ones_own_is_stretched_over_the_range(self, tmp_path, capsys):
+        write_image(tmp_path / "image.png", torch.rand(1, 64, 96))
+        write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm")]
+        assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
+        assert "depth 0.2975 to inf m" in capsys.readouterr().out
+        assert read_image(tmp_path / "out" / "coded_capture.png").shape == (3, 64, 96)
+        near = read_image(tmp_path / "out" / "depth.png")
+        assert near.min() == 0
+        assert near.max() == 1
+
+    @pytest.mark.takes_seconds
+    def test_feature_large_pictures_are_made_smaller(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.setattr(demo, "LARGEST", 48)
+        write_image(tmp_path / "image.png", torch.rand(3, 64, 96))
+        write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm")]
+        assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
+        assert "48 x 32 px" in capsys.readouterr().out
+
+    def test_exception_an_image_without_depth(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        assert main(["demo", "--image", "a.png"]) == 2
+        assert "--image and --depth belong together" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
+    def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+        assert main(["demo"]) == 2
+        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kornia_tidy.cli import main
+from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.design.tradeoff import TOLERANCES, read_csv, read_json
+from kornia_tidy.design.tradeoff import sweep as real_sweep
+from kornia_tidy.fidelity import LAYERS
+from tests.base import BaseTester
+from tests.design.tradeoff.samples import ROW
+
+QUICK = ["--size", "48", "--masks", "2", "--repeats", "1", "--base", "paper", "--reference", "paper"]
+KNOBS = ["--knobs", "layer_spacing"]
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Replace measurements by invented rows, and return the list of measured spacings in order."""
+    settings = []
+
+    def made_up(optics, image, depth, fidelity, *_, repeats, training):
+        settings.append(fidelity.layer_spacing)
+        return replace(ROW, fidelity=fidelity, repeats=repeats)
+
+    monkeypatch.setitem(real_sweep.__globals__, "measure", made_up)
+    return settings
+
+
+class TestTrade(BaseTester):
+    @pytest.mark.takes_seconds
+    def test_feature_writes_table_files_and_picture(self, tmp_path, capsys):
+        folder = tmp_path / "new" / "trade"
+        assert main(["trade", *QUICK, "--knobs", "layers", "--training", "-o", str(folder)]) == 0
+        told = capsys.readouterr().out
+        run = read_json(folder / "trade.json")
+        assert [row.value for row in run.rows] == list(LAYERS)
+        assert list(run.rows) == read_csv(folder / "trade.csv")
+        assert run.conditions.reference == "paper"
+        assert [row.rmse == 0 for row in run.rows] == [mode == "nearest" for mode in LAYERS]
+        assert all(row.training_seconds > 0 for row in run.rows)
+        assert told.count("| layers | ") == len(LAYERS) + 1  # and the column of that name
+        assert read_image(folder / "trade.png").shape == (3, 930, 1500)
+        assert {p.name for p in folder.iterdir()} == {"trade.json", "trade.csv", "trade.png"}
+        assert all(str(path) in told for path in folder.iterdir())
+
+    @pytest.mark.filterwarnings("default")
+    def test_feature_other_units_are_told(self, tmp_path, capsys, measured):
+        write_image(tmp_path / "image.png", torch.rand(3, 48, 48))
+        write_depth(tmp_path / "depth.png", torch.full((1, 48, 48), 1.1), 0.001)
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.png")]
+        assert main(["trade", *QUICK[2:], *KNOBS, *files, "-o", str(tmp_path / "new")]) == 0
+        told = [line for line in capsys.readouterr().err.splitlines() if "millimetres" in line]
+        assert len(told) == 1
+        assert told[0].startswith("kornia-tidy: warning: the nearest pixel is 1100 m away")
+
+    @pytest.mark.takes_seconds
+    def test_feature_an_interrupted_run_goes_on(self, tmp_path, monkeypatch, capsys, measured):
+        def interrupted(*args, **kwargs):
+            rows = real_sweep(*args, **kwargs)
+            yield next(rows)
+            yield next(rows)
+            raise KeyboardInterrupt
+
+        command = ["trade", *QUICK, *KNOBS, "-o", str(tmp_path)]
+        with monkeypatch.context() as patch:
+            patch.setattr(sys.modules["kornia_tidy.design.tradeoff.measure"], "sweep", interrupted)
+            assert main(command) == 130
+        assert "2 of 4 settings are written" in capsys.readouterr().out
+        assert [row.value for row in read_json(tmp_path / "trade.json").rows] == [2.5, 2.0]
+        assert main(command) == 0
+        assert measured == [2.5, 2.0, 1.0, 0.5]
+        assert "2 different ones to be measured" in capsys.readouterr().out
+        assert len(read_json(tmp_path / "trade.json").rows) == 4
+
+        assert main([*command, "--seed", "1"]) == 0  # another scene
+        assert len(measured) == 8
+        assert "of another scene, machine or code" in capsys.readouterr().out
+
+    @pytest.mark.usefixtures("measured")
+    def test_feature_rows_of_other_knobs_stay_in_the_file(self, tmp_path, capsys):
+        for knob in ("layers", "layer_spacing"):
+            assert main(["trade", *QUICK, "--knobs", knob, "-o", str(tmp_path)]) == 0
+        assert "linear" not in capsys.readouterr().out.rpartition("settings")[2]
+        knobs = {row.knob for row in read_json(tmp_path / "trade.json").rows}
+        assert knobs == {"layers", "layer_spacing"}
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.usefixtures("measured")
+    def test_feature_plans_are_measured_too_and_windows_fit_the_image(self, tmp_path):
+        assert main(["trade", *QUICK, "--knobs", "plan", "window", "-o", str(tmp_path)]) == 0
+        rows = read_json(tmp_path / "trade.json").rows
+        assert [row.value for row in rows if row.knob == "plan"] == list(TOLERANCES)
+        assert max(row.fidelity.window for row in rows if row.knob == "plan") == 95
+        assert [row.value for row in rows if row.knob == "window"] == [9, 17, 33, 65, None]
+
+    @pytest.mark.usefixtures("measured")
+    def test_feature_a_scene_of_ones_own(self, tmp_path, capsys):
+        write_image(tmp_path / "image.png", torch.rand(1, 48, 56))
+        write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 48 * 56).view(1, 48, 56))
+        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm"), "--fit-depth"]
+        assert main(["trade", *QUICK, "--knobs", "layers", *files, "-o", str(tmp_path / "out")]) == 0
+        told = read_json(tmp_path / "out" / "trade.json").conditions
+        assert (told.scene, told.height, told.width, told.channels) == ("image.png", 48, 56, 1)
+        assert "(psi +20.00 to -20.00)" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("arguments", "sentence"),
+        [
+            (["--image", "a.png"], "--image and --depth belong together"),
+            (["--device", "tpu"], "--device must be one of 'cpu', 'cuda', got 'tpu'"),
+            (["--device", "cpu:x"], "--device must be cpu, cuda or cuda:N, got 'cpu:x'"),
+        ],
+    )
+    def test_exception_is_one_sentence_before_any_work(self, arguments, sentence, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        assert main(["trade", *arguments]) == 2
+        assert sentence in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.takes_seconds
+    def test_exception_a_file_that_is_no_sweep_is_not_replaced(self, tmp_path, capsys):
+        (tmp_path / "trade.json").write_text("my notes")
+        assert main(["trade", *QUICK, "-o", str(tmp_path)]) == 2
+        assert "is not a readable sweep" in capsys.readouterr().err
+        assert (tmp_path / "trade.json").read_text() == "my notes"
+
+    def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+        assert main(["trade"]) == 2
+        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy.data import SceneStatistics
+from kornia_tidy.design.candidates import STARTS, coded_candidate, flat_candidate, initial_phase, search_lens
+from kornia_tidy.design.design_task import DesignTask, mask_of
+from kornia_tidy.modulator.modulator import SpatialLightModulator
+from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.modulator.switching import Switching
+from tests.base import BaseTester
+
+FEW = 3  # gradient steps
+LIKE_OTHERS = SceneStatistics(2.9, 1 / 256, 0.29, 0.23)
+
+
+class TestFlatCandidate(BaseTester):
+    def test_feature_f_numbers_rank_as_another_program_found(self):
+        """Errors of .0210, .0263, .0369, .0594 and .0875 at 57,000 electrons."""
+        task = DesignTask(statistics=LIKE_OTHERS)
+        errors = [flat_candidate(task, f_number, 0.5).image_error for f_number in (50, 71, 35, 25, 17.6)]
+        assert errors == sorted(errors)
+
+    def test_feature_less_light_wants_a_wider_aperture(self):
+        def best(electrons):
+            task = DesignTask(electrons=electrons)
+            return min((20, 28, 40, 57, 80), key=lambda f_number: flat_candidate(task, f_number, 0.5).image_error)
+
+        assert best(100) < best(100_000)
+
+    def test_feature_depth_is_told_by_a_wide_lens_focused_at_an_end(self):
+        task = DesignTask(depth_weight=1.0)
+        wide, stopped = flat_candidate(task, 17.6, 0.0), flat_candidate(task, 80.0, 0.0)
+        assert wide.depth_error < stopped.depth_error
+
+
+class TestCodedCandidate(BaseTester):
+    def test_feature_steps_lower_the_cost(self):
+        task = DesignTask(masks=2)
+        one, more = (coded_candidate(task, "focal sweep", 25.0, 0.5, steps) for steps in (1, 15))
+        assert more.cost < one.cost
+
+    def test_feature_the_same_seed_the_same_masks(self):
+        task = DesignTask(masks=2)
+        first, again, other = (coded_candidate(task, "random", 25.0, 0.5, FEW, seed) for seed in (3, 3, 4))
+        assert torch.equal(first.phase, again.phase)
+        assert not torch.equal(first.phase, other.phase)
+
+    def test_feature_several_masks_beat_the_best_flat_lens_in_bright_light(self):
+        """At 57,000 electrons another program found .0143 at f/25 against .0210, the best flat lens at f/50."""
+        task = DesignTask(statistics=LIKE_OTHERS)
+        masks = coded_candidate(task, "focal sweep", 25.0, 0.5, 20)
+        assert masks.image_error < 0.9 * flat_candidate(task, 50.0, 0.5).image_error
+
+    def test_feature_levels_and_switching_are_in_the_loop(self):
+        ideal = DesignTask(masks=3)
+        panel = SpatialLightModulator(GreyLevels(1), Switching(20e-3, 0.1, "random"))
+        coarse = coded_candidate(DesignTask(masks=3, modulator=panel), "focal sweep", 25.0, 0.5, FEW).image_error
+        assert coarse > 1.1 * coded_candidate(ideal, "focal sweep", 25.0, 0.5, FEW).image_error
+
+    @pytest.mark.parametrize("weight", [0.3, 1.0])
+    def test_smoke_depth_has_a_gradient_too(self, weight):
+        task = DesignTask(masks=1, depth_weight=weight)
+        few, more = (coded_candidate(task, "Fisher", 40.0, 0.5, steps) for steps in (1, 4))
+        assert more.cost < few.cost
+        assert 0 < more.depth_error < 12**-0.5
+        assert (more.image_error != more.image_error) is (weight == 1)
+
+    def test_smoke_calls_back_at_each_step(self):
+        calls = []
+        coded_candidate(DesignTask(masks=1), "random", 40.0, 0.5, FEW, each_step=lambda: calls.append(1))
+        assert len(calls) == FEW
+
+
+class TestInitialPhase(BaseTester):
+    @pytest.mark.parametrize("start", STARTS)
+    def test_cardinality(self, start):
+        assert initial_phase(DesignTask(masks=3, mask_size=21), start, 30.0, 0.5).shape == (3, 21, 21)
+
+    def test_feature_the_sweep_brings_its_depths_into_focus(self):
+        """Each mask of three is sharpest at its own third of the range of defocus."""
+        task = DesignTask(masks=3)
+        sweep = initial_phase(task, "focal sweep", 30.0, 0.5)
+        for number, phase in enumerate(sweep):
+            lens = search_lens(task, mask_of(phase[None]), 30.0, 0.5)
+            lo, hi = lens.camera.defocus_range
+            middles = [lo + (hi - lo) * (third + 0.5) / 3 for third in range(3)]
+            peaks = lens.psf_bank(defocus=middles).psfs.amax((1, 2, 3))
+            assert int(peaks.argmax()) == number

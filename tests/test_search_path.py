@@ -1,0 +1,96 @@
+"""Later imports, worker processes and programs after a change into a folder with files of the same names."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+from kornia_tidy.design.tradeoff.conditions import git_commit
+from kornia_tidy.search_path import find_program, import_installed
+from tests.base import BaseTester
+
+WORKERS = """
+import multiprocessing, os
+from kornia_tidy.{imported}
+if __name__ == "__main__":
+    multiprocessing.set_start_method({method!r})
+    os.chdir({folder!r})
+    {work}
+    print("done")
+"""
+WORK = {
+    "training": (
+        "training.scenes import SceneLoader; from kornia_tidy.data.dead_leaves import DeadLeaves",
+        "assert len(list(SceneLoader(DeadLeaves(4, 32, 32), batch=2, workers=1))) == 2",
+    ),
+    "rendering": (
+        "coded_datasets.render_scenes import _rendered; from torch.utils.data import TensorDataset",
+        "assert len(list(_rendered([{}, {}], [0, 1], 2))) == 2",
+    ),
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The current folder, in which everything notes that it was executed."""
+    here = tmp_path / "downloads"
+    here.mkdir()
+    for name in ("multiprocessing", "pickle", "torch", "h5py", "rawpy", "planted"):
+        (here / f"{name}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'a').write('{name}')\n")
+    (here / "git").write_text(f"#!/bin/sh\necho git >> {tmp_path / 'mark'}\necho planted\n")
+    (here / "git").chmod(0o755)
+    monkeypatch.chdir(here)
+    monkeypatch.setattr(sys, "path", ["", ".", *sys.path])
+    return here
+
+
+def executed(folder):
+    mark = folder.parent / "mark"
+    return mark.read_text() if mark.exists() else ""
+
+
+class TestSearchPath(BaseTester):
+    @pytest.mark.slow
+    @pytest.mark.parametrize("work", WORK)
+    @pytest.mark.parametrize("method", ["spawn", "forkserver"])
+    def test_feature_workers_start_without_the_current_folder(self, method, work, folder):
+        imported, line = WORK[work]
+        script = WORKERS.format(imported=imported, method=method, folder=str(folder), work=line)
+        options = {"cwd": folder.parent, "capture_output": True, "text": True}
+        done = subprocess.run([sys.executable, "-c", script], check=False, **options)
+        assert done.stdout == "done\n", done.stderr
+        assert executed(folder) == ""
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.skipif(find_spec("h5py") is None, reason="h5py is not installed")
+    def test_feature_a_reader_imports_its_package_from_where_it_is_installed(self, folder):
+        script = (
+            "import os\nfrom kornia_tidy.data.hdf5 import decode_hdf5\n"
+            f"os.chdir({str(folder)!r})\n"
+            "try: decode_hdf5(b'\\x89HDF\\r\\n\\x1a\\n')\nexcept ValueError as error: print(error)"
+        )
+        options = {"cwd": folder.parent, "capture_output": True, "text": True}
+        done = subprocess.run([sys.executable, "-c", script], check=False, **options)
+        assert "HDF5 is damaged" in done.stdout, done.stderr
+        assert executed(folder) == ""
+
+    def test_exception_what_is_not_installed_is_not_found_in_the_current_folder(self, folder):
+        with pytest.raises(ImportError, match="planted"):
+            import_installed("planted")
+        assert sys.path[:2] == ["", "."]
+        assert executed(folder) == ""
+
+    @pytest.mark.parametrize("path", [".", "", f".{os.pathsep}{{}}", f"{os.pathsep}{{}}"])
+    def test_feature_programs_come_from_the_folders_that_path_names(self, path, folder, monkeypatch):
+        monkeypatch.setenv("PATH", path.format(os.environ["PATH"]))
+        assert git_commit() != "planted"
+        assert executed(folder) == ""
+
+    def test_exception_a_program_that_is_missing(self, folder, monkeypatch):
+        monkeypatch.setenv("PATH", "downloads")
+        with pytest.raises(FileNotFoundError, match="no program git in the folders of PATH"):
+            find_program("git")
