@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from kornia_tidy.choices import LENSES, SYSTEMS, Preset
+from kornia_tidy.choices import SYSTEMS, Preset
+from kornia_tidy.cli.commands.lens_option import RealLens, camera_and_lens
 from kornia_tidy.cli.commands.parser import Argument, Parsed
 from kornia_tidy.cli.commands.shared import Out, Window, check_output
 from kornia_tidy.reconstruction.settings import LensSettings
-from kornia_tidy.settings import Choice, Count, Seed
+from kornia_tidy.settings import Count, Seed
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from kornia_tidy.camera.tidy_optics import TiDyOptics
-    from kornia_tidy.optics.lens.lens import Lens
-    from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 COLUMNS = 7
 CELLS = 23  # of a pupil without masks that a lens's own stop cuts: as good as more, and faster
@@ -77,8 +76,9 @@ class Psf:
         window: side of the PSFs, odd. None: as in a capture.
         fidelity: speed or accuracy. None: balanced, or as saved.
         mask_seed: of a system's masks.
-        settings: for --lens with a name, and for a file of masks alone; other cameras have their own.
-        lens: a real lens by its name, or a file that Lens.save wrote. None: an ideal lens, or as saved.
+        settings: for --lens with a name or surfaces, and for a file of masks alone; other cameras have their own.
+        lens: a real lens by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json). None: an ideal
+            lens, or as saved.
         field: number of heights on the sensor from the axis to the corner that the lens is made for. None: the axis.
     """
 
@@ -89,7 +89,7 @@ class Psf:
     fidelity: Preset | None = None
     mask_seed: Seed = 0
     settings: LensSettings = dataclasses.field(default_factory=LensSettings)
-    lens: Annotated[str, Choice("NAME|FILE", choices=LENSES, others=True)] | None = None
+    lens: RealLens | None = None
     field: Count | None = None
 
     examples: ClassVar = """\
@@ -97,6 +97,7 @@ class Psf:
   kornia-tidy psf runs/edof/best.safetensors --depths 0.4,0.6,1,inf -o psfs.png
   kornia-tidy psf heights.npy --focus-distance 1 --aperture-diameter 4e-3
   kornia-tidy psf --lens double-gauss-50mm --f-number 8 --focus-distance 1 --field 5
+  kornia-tidy psf --lens lens.zmx --f-number 4 --focus-distance 2 --field 5
   kornia-tidy psf tidy-5 --lens single-50mm --field 3 --depths 0.4,0.6,inf
 """
 
@@ -163,7 +164,7 @@ class Psf:
             raise ValueError(f"{name} has a lens of its own: --lens is for files of masks alone and published systems")
         if (saved is not None or (name in SYSTEMS and self.lens is None)) and self.settings != LensSettings():
             raise ValueError(f"{name} has a lens of its own: --focal-length and the like are for files of masks alone")
-        camera, lens = self._lens()
+        camera, lens = camera_and_lens(self.lens, self.settings)
         if name is None:
             optics = TiDyOptics(NoMask(CELLS), camera, fidelity=fidelity, lens=lens)
         elif name in SYSTEMS:
@@ -178,25 +179,6 @@ class Psf:
         window = optics.window if self.window is None else self.window
         return optics.with_fidelity(settings.replace(name=settings.name, window=window, stray_light="discard"))
 
-    def _lens(self) -> tuple[ThinLensCamera, Lens | str | None]:
-        """Return the camera of the options, which is that of the lens where there is one."""
-        from kornia_tidy.optics.lens.lens import Lens
-        from kornia_tidy.optics.lens.made_lenses import named_focal_length
-
-        given = [name for name, value in vars(self.settings).items() if value != getattr(LensSettings(), name)]
-        if self.lens is None:
-            return self.settings.camera(), None
-        if self.lens in LENSES:
-            _refuse(self.lens, given, ("focal_length",))
-            return replace(self.settings, focal_length=named_focal_length(self.lens)).camera(), self.lens
-        if not Path(self.lens).is_file():
-            raise FileNotFoundError(
-                f"--lens must be one of {', '.join(map(repr, LENSES))}, or a file, got {self.lens!r:.80}"
-            )
-        _refuse(self.lens, given, ("focal_length", "f_number", "aperture_diameter", "focus_distance"))
-        lens = Lens.load(self.lens)
-        return lens.camera(self.settings.pixel_pitch, self.settings.depth_range), lens
-
     def _defocus(self, optics: TiDyOptics) -> Tensor:
         """Return the defocus of the requested depths in radians, ascending, (D,)."""
         import torch
@@ -209,10 +191,3 @@ class Psf:
         if self.field is not None:
             return depths_around_focus(optics.camera)
         return torch.linspace(lo, hi, COLUMNS, dtype=torch.float64)
-
-
-def _refuse(lens: str, given: list[str], own: tuple[str, ...]) -> None:
-    """Raise ``ValueError`` if an option was given for what a lens has of its own."""
-    for name in given:
-        if name in own:
-            raise ValueError(f"the lens {lens} has its own: leave out --{name.replace('_', '-')}")

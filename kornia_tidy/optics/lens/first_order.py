@@ -14,7 +14,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """A lens at an f-number and a focus, all lengths in metres, paraxial at 530 nm.
+    """A lens at an f-number and a focus, all lengths in metres, paraxial at 530 nm unless another wavelength is asked for.
 
     Args:
         prescription: the lens.
@@ -39,13 +39,16 @@ class FirstOrder:
     rear: Array
 
 
-def first_order(prescription: Prescription, f_number: float, focus_distance: float) -> FirstOrder:
+def first_order(
+    prescription: Prescription, f_number: float, focus_distance: float, wavelength: float = REFERENCE_WAVELENGTH
+) -> FirstOrder:
     """Return the paraxial quantities of a lens.
 
     Args:
         prescription: the lens.
         f_number: focal length over diameter of the entrance pupil.
         focus_distance: from the entrance pupil to the plane in focus, in metres; ``inf`` is allowed.
+        wavelength: in metres.
 
     Raises:
         ValueError: if the lens does not collect light, or its stop has no image in front of it.
@@ -53,7 +56,7 @@ def first_order(prescription: Prescription, f_number: float, focus_distance: flo
     Source: Born and Wolf, Principles of Optics, section 4.4 (matrices of paraxial rays).
     """
     surfaces, stop = prescription.surfaces, prescription.stop
-    indices = prescription.indices(REFERENCE_WAVELENGTH)
+    indices = prescription.indices(wavelength)
     vertices = np.concatenate([[0.0], np.cumsum([s.gap for s in surfaces[:-1]])])
     vertices = vertices - vertices[next(i for i, s in enumerate(surfaces) if not s.is_stop)]
     whole = _matrix(surfaces, vertices, indices)

@@ -119,7 +119,7 @@ class Lens(nn.Module):
     @classmethod
     def from_prescription(
         cls,
-        prescription: Mapping[str, Any] | Prescription,
+        prescription: Mapping[str, Any] | Prescription | str | os.PathLike[str],
         f_number: float,
         focus_distance: float,
         wavelengths: Sequence[float] = RGB,
@@ -129,12 +129,13 @@ class Lens(nn.Module):
         """Return a lens traced from its surfaces.
 
         Args:
-            prescription: surfaces and glasses as plain data, see :meth:`~kornia_tidy.optics.lens.Prescription.read`.
+            prescription: surfaces and glasses as plain data, see :meth:`~kornia_tidy.optics.lens.Prescription.read`; or
+                a file: Zemax ``.zmx``, CODE V ``.seq``, or ``.json`` by Optiland, by DeepLens, or of such plain data.
             f_number: focal length over diameter of the entrance pupil.
             focus_distance: from the entrance pupil to the plane in focus, in metres; ``inf`` is allowed.
             wavelengths: in metres, one or more; light between them is interpolated.
             field: largest height on the sensor in metres. Default: half the diagonal of the prescription's
-                ``"sensor"``.
+                ``"sensor"``, or the largest field of the file.
             nearest: nearest depth in metres. Default: half the focus distance, or that of a defocus of 20 rad if it is
                 nearer.
 
@@ -144,6 +145,9 @@ class Lens(nn.Module):
 
         Convention:
             - The table reaches from infinity to the nearest depth.
+            - Of files surfaces of revolution with one stop are read. A stop on a refracting surface becomes the plane
+              through its vertex, on the side of air. Where the file has its object at infinity and its sensor near
+              focus, the sensor keeps its distance from the paraxial focus at the file's primary wavelength.
         """
         return cls(*traced_parts(prescription, f_number, focus_distance, wavelengths, field, nearest))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -13,7 +14,8 @@ from kornia_tidy.optics.lens.first_order import first_order
 from kornia_tidy.optics.lens.ideal_table import Wavefront, ideal_table
 from kornia_tidy.optics.lens.lens_table import LensTable
 from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
-from kornia_tidy.optics.lens.prescription import Prescription
+from kornia_tidy.optics.lens.prescription import Prescription, half_diagonal
+from kornia_tidy.optics.lens.prescription_files import read_prescription_file
 from kornia_tidy.optics.lens.table_fit import fit_table
 from kornia_tidy.optics.spectrum import LONGEST, REFERENCE_WAVELENGTH, SHORTEST
 from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
@@ -58,7 +60,7 @@ def named_focal_length(name: str) -> float:
 
 @on_cpu
 def traced_parts(
-    prescription: Mapping[str, Any] | Prescription,
+    prescription: Mapping[str, Any] | Prescription | str | os.PathLike[str],
     f_number: float,
     focus_distance: float,
     wavelengths: Sequence[float],
@@ -66,10 +68,12 @@ def traced_parts(
     nearest: float | None,
 ) -> LensParts:
     """Return a lens traced from its surfaces. See :meth:`~kornia_tidy.optics.lens.lens.Lens.from_prescription`."""
-    if field is None and isinstance(prescription, Mapping):
-        field = _half_diagonal(prescription)
-    if not isinstance(prescription, Prescription):
-        prescription = Prescription.read(prescription)
+    own = None
+    if isinstance(prescription, (str, os.PathLike)):
+        prescription, own = read_prescription_file(prescription)
+    elif not isinstance(prescription, Prescription):
+        own, prescription = half_diagonal(prescription), Prescription.read(prescription)
+    field = own if field is None else field
     waves = checked_wavelengths(wavelengths)
     check_positive("f_number", f_number)
     if f_number < FASTEST:
@@ -138,15 +142,3 @@ def _check_field(field: float) -> None:
     check_number("field", field, "metres")
     if field != 0:
         check_metres("field", field, 1e-6, 1.0, "21.6 mm is 21.6e-3")
-
-
-def _half_diagonal(prescription: Mapping[str, Any]) -> float | None:
-    """Return half the diagonal of the sensor that a prescription names, in metres."""
-    sensor, pitch = prescription.get("sensor"), prescription.get("pitch_um")
-    if sensor is None or pitch is None:
-        return None
-    if not isinstance(sensor, Sequence) or len(sensor) != 2 or isinstance(sensor, str):
-        raise TypeError(f"sensor of the prescription must be (rows, columns), got {sensor!r:.60}")
-    for value in (*sensor, pitch):
-        check_positive("sensor and pitch_um of the prescription", value)
-    return 0.5e-6 * pitch * math.hypot(*sensor)

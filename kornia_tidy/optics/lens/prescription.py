@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from kornia_tidy.checks import check_choice, described
+from kornia_tidy.checks import check_choice, check_positive, described
 from kornia_tidy.optics.materials import DISPERSIONS, Material, cauchy_through, constant_index
 
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -18,6 +18,7 @@ MOST_SURFACES, HIGHEST_POWER = 200, 30
 _SURFACE_KEYS = {"kind", "R", "k", "poly", "t", "glass", "r"}
 _KEYS = {"name", "source", "unit", "surfaces", "index", "image_plane_infinity"}
 _NOTES = {"index_source", "fnumbers", "focus", "pitch_um", "sensor"}  # of collections; pitch_um says millimetres
+_FORMULAS = {"sellmeier": "_sellmeier", "powers": "_root_power_series"}  # of indices in a prescription
 _LINES = (486.1327e-9, 587.5618e-9, 656.2725e-9)  # m; F, d and C, at which Abbe's number is defined
 
 
@@ -87,7 +88,8 @@ class Prescription:
                 ``"R"`` (radius, None for a plane), ``"k"`` (conic constant), ``"poly"`` ({power: coefficient}),
                 ``"t"`` (distance to the next vertex), ``"glass"`` (behind it, default ``"air"``) and ``"r"`` (clear
                 radius or None); ``"index"``, {glass: index}, where an index is a number, {wavelength in nm: number},
-                {"nd": ..., "vd": ...} or {"sellmeier": [[b, c in um^2], ...]}; and, as far as they are known,
+                {"nd": ..., "vd": ...}, {"sellmeier": [[b, c in um^2], ...]} or {"powers": [[c, p], ...]} for
+                n^2 as a sum of c um^p; and, as far as they are known,
                 ``"name"``, ``"source"``, ``"image_plane_infinity"`` and ``"unit"`` of all lengths, ``"m"`` or
                 ``"mm"``. Default: metres; millimetres where ``"pitch_um"`` stands, as in tables of reference lenses.
 
@@ -139,6 +141,18 @@ class Prescription:
             _glasses(given.get("index", {}), surfaces),
             None if plane is None else _number("image_plane_infinity", plane) * scale,
         )
+
+
+def half_diagonal(prescription: Mapping[str, Any]) -> float | None:
+    """Return half the diagonal of the sensor that a prescription names, in metres."""
+    sensor, pitch = prescription.get("sensor"), prescription.get("pitch_um")
+    if sensor is None or pitch is None:
+        return None
+    if not isinstance(sensor, Sequence) or len(sensor) != 2 or isinstance(sensor, str):
+        raise TypeError(f"sensor of the prescription must be (rows, columns), got {sensor!r:.60}")
+    for value in (*sensor, pitch):
+        check_positive("sensor and pitch_um of the prescription", value)
+    return 0.5e-6 * pitch * math.hypot(*sensor)
 
 
 def _surface(i: int, row: Any, scale: float, *, last: bool) -> Surface:
@@ -201,16 +215,16 @@ def _material(glass: str, given: Any) -> Material:
     what = f"index of {glass!r:.60}"
     if not isinstance(given, Mapping):
         return constant_index(_index(what, given))
-    if set(given) == {"sellmeier"}:
-        terms = given["sellmeier"]
+    if len(given) == 1 and (form := next(iter(given))) in _FORMULAS:
+        terms = given[form]
         if (
             not isinstance(terms, Sequence)
             or not terms
             or any(not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2 for pair in terms)
         ):
-            raise ValueError(f"{what} must have pairs of b and c under 'sellmeier', got {terms!r:.60}")
-        pairs = tuple((_number(f"b in {what}", b), _number(f"c in {what}", c)) for b, c in terms)
-        return Material(glass, "prescription", DISPERSIONS["_sellmeier"], pairs)
+            raise ValueError(f"{what} must have pairs of numbers under {form!r}, got {terms!r:.60}")
+        pairs = tuple((_number(f"numbers in {what}", b), _number(f"numbers in {what}", c)) for b, c in terms)
+        return Material(glass, "prescription", DISPERSIONS[_FORMULAS[form]], pairs)
     if set(given) == {"nd", "vd"}:
         nd, vd = _index(f"nd in {what}", given["nd"]), _number(f"vd in {what}", given["vd"], nonzero=True)
         blue, line, red = (wavelength * 1e6 for wavelength in _LINES)

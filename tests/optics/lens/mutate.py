@@ -1,4 +1,4 @@
-"""Damaged prescriptions, Zernike tables and files of lenses: ``python -m tests.optics.lens.mutate --count 2000``.
+"""Damaged prescriptions, files of optical programs, Zernike tables and lenses: ``python -m tests.optics.lens.mutate --count 2000``.
 
 Each must be accepted, with finite numbers, or be refused in one sentence by a ``ValueError`` or ``TypeError``.
 """
@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from kornia_tidy.optics import Lens
 from tests.optics.lens.lenses import plano_convex, symmetric_pair
+from tests.optics.lens.written_files import WRITERS, aspheric, doublet, named
 
 SECONDS, LONGEST = 30.0, 400  # of processor time for a lens, and characters of a sentence
 MEMORY = 6 << 30
@@ -50,6 +51,13 @@ WORDS = (
     "field_mm",
     "-1e30",
 )
+
+
+PROGRAM_WORDS = (
+    *WORDS, "INFINITY", "SURF", "STOP", "TYPE", "COORDBRK", "EVENASPH", "GLAS", "MIRROR", "___BLANK", "XDAT", "UNIT",
+    "IN", "CURV", "DISZ", "PARM", "S", "SO", "SI", "STO", "ASP", "K", "A", "CIR", "REFL", "500.500", "PRV", "RDM", "DIM",
+    "{", "}", "[", "null", "true", "1e-300", "1e300", "9" * 400,
+)  # fmt: skip
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -83,15 +91,15 @@ def mutated(value: Any, draw: random.Random) -> Any:
     return value
 
 
-def damaged_text(text: str, draw: random.Random) -> str:
-    """The text with a word or a line replaced, removed or doubled."""
+def damaged_text(text: str, draw: random.Random, words: tuple[str, ...], mark: str | None) -> str:
+    """The text with a word or a line replaced, removed or doubled; words lie between marks."""
     lines = text.splitlines()
     row = draw.randrange(len(lines))
     kind = draw.choice(("word", "word", "word", "remove", "double", "cut"))
     if kind == "word":
-        words = lines[row].split(",")
-        words[draw.randrange(len(words))] = draw.choice(WORDS)
-        lines[row] = ",".join(words)
+        parts = lines[row].split(mark) or [""]
+        parts[draw.randrange(len(parts))] = draw.choice(words)
+        lines[row] = (mark or " ").join(["  "] * (mark is None and lines[row][:1] == " ") + parts)
     elif kind == "cut":
         return text[: draw.randrange(len(text))]
     else:
@@ -113,7 +121,7 @@ def damaged_bytes(data: bytes, draw: random.Random) -> bytes:
 def trial(seed: int, folder: Path) -> Callable[[], Lens]:
     """What makes the lens of a seed."""
     draw = random.Random(seed)
-    kind = draw.choice(("prescription", "prescription", "numbers", "table", "file"))
+    kind = draw.choice(("prescription", "prescription", "numbers", "table", "file", "program", "program", "program"))
     if kind in {"prescription", "numbers"}:
         given: dict[str, Any] = {"f_number": 8.0, "focus_distance": 0.6, "field": 4e-3, "wavelengths": [530e-9]}
         prescription = draw.choice((plano_convex, symmetric_pair))()
@@ -122,10 +130,21 @@ def trial(seed: int, folder: Path) -> Callable[[], Lens]:
         else:
             given = mutated(given, draw)
         return lambda: Lens.from_prescription(prescription, **given)
+    if kind == "program":
+        suffix = draw.choice(list(WRITERS))
+        given = draw.choice((doublet, lambda: named("single-50mm")) if suffix == ".seq" else (doublet, aspheric))()
+        path, text = folder / f"lens{suffix}", WRITERS[suffix](given)
+        if suffix.endswith(".json") and draw.random() < 0.8:
+            text = json.dumps(mutated(json.loads(text), draw), default=repr)
+        else:
+            text = damaged_text(text, draw, PROGRAM_WORDS, None)
+        data = text.encode(draw.choice(("utf-8", "utf-8", "utf-16")))
+        path.write_bytes(damaged_bytes(data, draw) if draw.random() < 0.2 else data)
+        return lambda: Lens.from_prescription(path, 8.0, 0.6, wavelengths=[530e-9], field=4e-3)
     path = folder / f"lens.{'csv' if kind == 'table' else 'safetensors'}"
     if kind == "table":
         text = "field_mm,wavelength_nm,Z4,Z7\n0,530,0.1,0.0\n2.5,530,0.1,0.2\n5,530,0.1,0.4\n"
-        path.write_text(damaged_text(text, draw))
+        path.write_text(damaged_text(text, draw, WORDS, ","))
         return lambda: Lens.from_zernike_table(path, 50e-3, 8.0, 0.6)
     Lens.from_seidel(50e-3, 8.0, 0.6, 5e-3, coma=1.0).save(path)
     path.write_bytes(damaged_bytes(path.read_bytes(), draw))
