@@ -11,12 +11,14 @@ from kornia_tidy.optics.lens.glasses import catalogue_glass
 
 UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 _POWERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # of an asphere's coefficients; there is no I
+_FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 _FICTITIOUS = re.compile(r"\d{3,6}\.\d{3,6}")  # digits of nd - 1, and of Abbe's number after two
 # Commands that say how the lens is used, drawn, made or improved, not what it is.
 _DISPLACED = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "CUF")  # allowed where they are 0
-_WITHOUT_EFFECT = frozenset(
-    "CAN CCY CLS CWL DER END EPD FNO GO INI LEN LOC NA NAO NAX PIM PRE SLB SPH THC TEM VLX VLY VUX VUY WTF WTW "
-    "ASP CON KC AC BC CC DC EC FC GC HC JC".split()
+_WITHOUT_EFFECT = (
+    *("ASP", "CAN", "CCY", "CLS", "CON", "CWL", "DER", "EPD", "FNO", "GO", "INI", "LEN", "LOC", "NA", "NAO"),
+    *("PIM", "PRE", "SLB", "SPH", "TEM", "THC", "VLX", "VLY", "VUX", "VUY", "WTF", "WTW", "KC"),
+    *(f"{letter}C" for letter in _POWERS),
 )
 
 
@@ -82,38 +84,40 @@ class _Reader:
 
     def _command(self, name: str, words: Sequence[str]) -> None:
         command = name.upper()[:3]  # what follows is for people
-        if self.private is not None and command not in ("END", "PRV"):
+        if command in ("PRV", "END"):
+            self.private = [] if command == "PRV" else None
+        elif self.private is not None:
             self._private(name, words)
-        elif command in ("SO", "SI", "S"):
+        elif command in ("SO", "S", "SI"):
             self._surface(command, words)
-        elif command == "PRV":
-            self.private = []
-        elif command == "END":
-            self.private = None
-        elif command == "TIT":
+        elif self.surfaces and command in ("STO", "CIR", "K", *_POWERS):
+            self._of_surface(self.surfaces[-1], command, words)
+        elif not self._of_lens(command, words):
+            displaced = command not in _DISPLACED or any(number(f"{command} of a surface", word) for word in words)
+            if displaced and command not in _WITHOUT_EFFECT:
+                where = self.surfaces[-1].where if self.surfaces and not self.ended else "it"
+                raise ValueError(f"{where} has the command {name!r:.60}, which is not read")
+
+    def _of_lens(self, command: str, words: Sequence[str]) -> bool:
+        """Take a command that says something of the whole lens, and return whether it was one."""
+        first = words[0] if words else ""
+        if command == "TIT":
             self.lens.name = " ".join(words).strip("'\"")
         elif command == "DIM":
-            unit = words[0].upper() if words else ""
-            if unit not in UNITS:
-                raise ValueError(f"its DIM must be one of {', '.join(UNITS)}, got {unit!r:.60}")
-            self.lens.unit = UNITS[unit]
+            if first.upper() not in UNITS:
+                raise ValueError(f"its DIM must be one of {', '.join(UNITS)}, got {first!r:.60}")
+            self.lens.unit = UNITS[first.upper()]
         elif command == "RDM":
-            self.radii = not (words and words[0].upper().startswith("N"))
+            self.radii = not first.upper().startswith("N")
         elif command == "WL":
             self.wavelengths = [number("its wavelengths", word) for word in words]
         elif command == "REF":
-            self.reference = int(number("its REF", words[0] if words else ""))
-        elif command in ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB"):
+            self.reference = int(number("its REF", first))
+        elif command in _FIELDS:
             self.sides[command] = max((abs(number("its fields", word)) for word in words), default=0.0)
-        elif command == "STO" and words:
-            self.stop = int(number("its stop", words[0].upper().removeprefix("S")))
-        elif self.surfaces and command in ("STO", "K", "CIR", *_POWERS):
-            self._of_surface(self.surfaces[-1], command, words)
-        elif command in _DISPLACED and not any(number(f"{command} of a surface", word) for word in words):
-            pass
-        elif command not in _WITHOUT_EFFECT:
-            where = self.surfaces[-1].where if self.surfaces and not self.ended else "it"
-            raise ValueError(f"{where} has the command {name!r:.60}, which is not read")
+        else:
+            return False
+        return True
 
     def _surface(self, command: str, words: Sequence[str]) -> None:
         if self.radii is None:
@@ -151,7 +155,10 @@ class _Reader:
 
     def _of_surface(self, surface: FileSurface, command: str, words: Sequence[str]) -> None:
         if command == "STO":
-            surface.stop = True
+            if words:
+                self.stop = int(number("its stop", words[0].upper().removeprefix("S")))
+            else:
+                surface.stop = True
         elif command == "CIR":
             *kinds, radius = words or [""]
             if any(word.upper() not in ("EDG", "CLR") for word in kinds):
@@ -177,10 +184,10 @@ class _Reader:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """Yield the commands of a file as words: a semicolon parts them, an ampersand goes on, an exclamation mark comments.
+    r"""Yield the commands of a file as words: semicolons part them, and after an ampersand they go on in the next line.
 
     Example:
-        >>> list(commands("RDM;LEN  'a; b' ! new\\nS 1.0 &\\n  2.0"))
+        >>> list(commands("RDM;LEN  'a; b' ! a comment\nS 1.0 &\n  2.0"))
         [['RDM'], ['LEN', "'a; b'"], ['S', '1.0', '2.0']]
     """
     joined = re.sub(r"&[ \t]*\r?\n", " ", re.sub(r"!.*", "", text))

@@ -14,7 +14,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """A lens at an f-number and a focus, all lengths in metres, paraxial at 530 nm unless another wavelength is asked for.
+    """A lens at an f-number and a focus, all lengths in metres, paraxial at one wavelength.
 
     Args:
         prescription: the lens.

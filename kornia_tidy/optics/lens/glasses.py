@@ -62,7 +62,7 @@ def _plain(name: str) -> str:
 def _catalogue() -> dict[tuple[str, str], dict[str, Any]]:
     """Return each glass of the table: s stands for Sellmeier's formula, p for a power series of n^2."""
     table = {}
-    for row in files(__package__).joinpath("glasses.csv").read_text("utf-8").splitlines()[1:]:
+    for row in files("kornia_tidy.optics.lens").joinpath("glasses.csv").read_text("utf-8").splitlines()[1:]:
         maker, name, formula, *numbers = row.split(",")
         values = [float(number) for number in numbers]
         pairs = list(zip(values[::2], values[1::2], strict=True))

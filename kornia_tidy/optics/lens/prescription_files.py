@@ -36,9 +36,12 @@ def read_prescription_file(path: str | os.PathLike[str]) -> tuple[Prescription, 
         if len(data) > LONGEST:
             raise ValueError(f"it must have at most {LONGEST} bytes, got {len(data)}")
         text = _text(data)
-        value = parse_json(text) if suffix == ".json" else None
-        lens = read_json_lens(value) if suffix == ".json" else (read_zemax if suffix == ".zmx" else read_codev)(text)
-        found, height = (Prescription.read(value), half_diagonal(value)) if lens is None else lens_of(lens)
+        if suffix == ".json":
+            value = parse_json(text)
+            lens = read_json_lens(value)
+            found, height = (Prescription.read(value), half_diagonal(value)) if lens is None else lens_of(lens)
+        else:
+            found, height = lens_of(read_zemax(text) if suffix == ".zmx" else read_codev(text))
         return replace(found, name=found.name or Path(path).stem), height
     except (ValueError, TypeError) as error:
         raise ValueError(f"cannot read {path}: {error}") from None

@@ -14,11 +14,13 @@ TYPES = ("STANDARD", "EVENASPH", "ODDASPHE")
 MOST_TERMS = 8  # of an asphere
 _ANGLES, _HEIGHTS = ("0",), ("2", "3")  # kinds of field: angles, and heights on the sensor
 # Keywords of a surface that say how it is drawn, coated, made or found by the program, not what it is.
-_WITHOUT_EFFECT = frozenset(
-    "BLNK COAT COFN COMM EDGE FIMP HIDE MAZH MEMA MIRR OEMA PICK POPS PPAR PUSH PZUP SLAB VCON VDSZ VPAR".split()
+_WITHOUT_EFFECT = (
+    *("BLNK", "COAT", "COFN", "COMM", "EDGE", "FIMP", "HIDE", "MAZH", "MEMA", "MIRR", "OEMA", "PICK", "POPS", "PPAR"),
+    *("PUSH", "PZUP", "SLAB", "VCON", "VDSZ", "VPAR"),
 )
 _NUMBERS = {"CURV": "curvature", "CONI": "conic"}
-_OF_SURFACES = frozenset("TYPE CURV CONI DISZ STOP PARM GLAS CLAP FLAP DIAM OBDC XDAT".split())
+_OF_SURFACES = ("TYPE", "CURV", "CONI", "DISZ", "STOP", "PARM", "GLAS", "CLAP", "FLAP", "DIAM", "OBDC", "XDAT")
+_EDGES = ("CLAP", "FLAP", "DIAM")  # the first that there is counts
 _MIRROR, _MODEL = "MIRROR", "1"
 
 
@@ -67,10 +69,10 @@ def read_zemax(text: str) -> FileLens:
     return lens
 
 
-def _blocks(text: str) -> tuple[dict[str, list[list[str]]], list[list[list[str]]]]:
+def _blocks(text: str) -> tuple[dict[str, list[Sequence[str]]], list[list[Sequence[str]]]]:
     """Return the words behind each keyword of the header, and the lines of each surface as words."""
-    header: dict[str, list[list[str]]] = {}
-    blocks: list[list[list[str]]] = []
+    header: dict[str, list[Sequence[str]]] = {}
+    blocks: list[list[Sequence[str]]] = []
     for line in text.splitlines():
         words = line.split()
         if not words:
@@ -84,12 +86,12 @@ def _blocks(text: str) -> tuple[dict[str, list[list[str]]], list[list[list[str]]
     return header, blocks
 
 
-def _first(header: dict[str, list[list[str]]], keyword: str, default: str) -> str:
+def _first(header: dict[str, list[Sequence[str]]], keyword: str, default: str) -> str:
     words = header.get(keyword, [[]])[-1]
     return words[0].upper() if words else default
 
 
-def _primary(header: dict[str, list[list[str]]]) -> float | None:
+def _primary(header: dict[str, list[Sequence[str]]]) -> float | None:
     """Return the primary wavelength in metres."""
     wanted = _first(header, "PWAV", "1")
     for words in header.get("WAVM", []):
@@ -98,7 +100,7 @@ def _primary(header: dict[str, list[list[str]]]) -> float | None:
     return None
 
 
-def _largest_field(header: dict[str, list[list[str]]]) -> float | None:
+def _largest_field(header: dict[str, list[Sequence[str]]]) -> float | None:
     sides = []
     for keywords in (("XFLN", "XFLD"), ("YFLN", "YFLD")):
         words = next((header[keyword][-1] for keyword in keywords if keyword in header), [])
@@ -108,44 +110,47 @@ def _largest_field(header: dict[str, list[list[str]]]) -> float | None:
 
 def _surface(i: int, block: Sequence[Sequence[str]], indices: dict[str, Any], catalogues: Sequence[str]) -> FileSurface:
     surface = FileSurface(f"surface {i}")
-    kind, terms, edges, extra = "STANDARD", {}, {}, False
+    lines: dict[str, list[Sequence[str]]] = {}
     for keyword, *words in block:
-        if keyword in _NUMBERS:
-            setattr(surface, _NUMBERS[keyword], number(f"{keyword} of {surface.where}", words[0] if words else ""))
-        elif keyword == "TYPE":
-            kind = words[0].upper() if words else ""
-        elif keyword == "DISZ":
-            infinite = bool(words) and words[0].upper() == "INFINITY"
-            surface.gap = math.inf if infinite else number(f"DISZ of {surface.where}", words[0] if words else "")
-        elif keyword == "STOP":
-            surface.stop = True
-        elif keyword == "PARM":
-            term = number(f"PARM of {surface.where}", words[0] if words else "")
-            terms[term] = number(f"PARM of {surface.where}", words[1] if len(words) > 1 else "")
-        elif keyword == "GLAS":
-            surface.glass = _glass(surface.where, words, indices, catalogues)
-        elif keyword in ("CLAP", "FLAP", "DIAM"):
-            edges[keyword] = _edge(surface.where, keyword, words)
-        elif keyword == "OBDC":
-            if any(number(f"OBDC of {surface.where}", word) for word in words[:2]):
-                raise ValueError(
-                    f"the aperture of {surface.where} must stand about the axis, got OBDC {' '.join(words):.60}"
-                )
-        elif keyword == "XDAT":
-            extra = extra or any(number(f"XDAT of {surface.where}", word) for word in words[1:2])
-        elif keyword not in _WITHOUT_EFFECT:
+        lines.setdefault(keyword, []).append(words)
+    for keyword in lines:
+        if keyword not in (*_OF_SURFACES, *_WITHOUT_EFFECT):
             raise ValueError(f"{surface.where} has {keyword!r:.60}, which is not read")
+    kind = _first(lines, "TYPE", "STANDARD")
     if kind not in TYPES:
         raise ValueError(f"{surface.where} must be of type {', '.join(TYPES)}, got {kind!r:.60}")
-    if extra:
+
+    def value(keyword: str, words: Sequence[str], place: int = 0) -> float:
+        return number(f"{keyword} of {surface.where}", words[place] if len(words) > place else "")
+
+    if any(value("XDAT", words, 1) for words in lines.get("XDAT", [])):
         raise ValueError(f"{surface.where} has extra data (XDAT), which are not read")
+    for words in lines.get("OBDC", []):
+        if value("OBDC", words) or value("OBDC", words, 1):
+            moved = " ".join(words)
+            raise ValueError(f"the aperture of {surface.where} must stand about the axis, got OBDC {moved:.60}")
+    for keyword, name in _NUMBERS.items():
+        for words in lines.get(keyword, []):
+            setattr(surface, name, value(keyword, words))
+    for words in lines.get("DISZ", []):
+        surface.gap = math.inf if [word.upper() for word in words[:1]] == ["INFINITY"] else value("DISZ", words)
     if kind != "STANDARD":
-        step = 2 if kind == "EVENASPH" else 1
-        if beyond := [term for term, value in terms.items() if value and term not in range(1, MOST_TERMS + 1)]:
-            raise ValueError(f"PARM of {surface.where} must be from 1 to {MOST_TERMS}, got {beyond[0]:g}")
-        surface.powers = {step * int(term): value for term, value in terms.items() if value}
-    surface.clear = next((edges[keyword] for keyword in ("CLAP", "FLAP", "DIAM") if edges.get(keyword)), None)
+        terms = {value("PARM", words): value("PARM", words, 1) for words in lines.get("PARM", [])}
+        surface.powers = _powers(surface.where, terms, 2 if kind == "EVENASPH" else 1)
+    for words in lines.get("GLAS", []):
+        surface.glass = _glass(surface.where, words, indices, catalogues)
+    surface.stop = "STOP" in lines
+    edges = [_edge(surface.where, keyword, words) for keyword in _EDGES for words in lines.get(keyword, [])]
+    surface.clear = next((edge for edge in edges if edge), None)
     return surface
+
+
+def _powers(where: str, terms: dict[float, float], step: int) -> dict[int, float]:
+    """Return the powers of an asphere from its parameters, of which each stands for a step of the power."""
+    for term, value in terms.items():
+        if value and term not in range(1, MOST_TERMS + 1):
+            raise ValueError(f"PARM of {where} must be from 1 to {MOST_TERMS}, got {term:g}")
+    return {step * int(term): value for term, value in terms.items() if value}
 
 
 def _glass(where: str, words: Sequence[str], indices: dict[str, Any], catalogues: Sequence[str]) -> str:

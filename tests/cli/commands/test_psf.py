@@ -12,6 +12,7 @@ from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.optics import Lens
 from tests.base import BaseTester
+from tests.optics.lens.written_files import doublet, zemax
 
 
 def rows(text: str) -> list[list[str]]:
@@ -99,9 +100,20 @@ class TestPsf(BaseTester):
         assert main(["psf", "--lens", "double-gauss-50mm", *words, *output]) == 0
         assert "51.4973 mm f/11, focus at 0.8 m" in capsys.readouterr().out
 
+    @pytest.mark.takes_seconds
+    def test_feature_a_file_of_surfaces_is_traced_at_the_f_number_and_focus_of_the_options(self, tmp_path, capsys):
+        (tmp_path / "lens.zmx").write_text(zemax(doublet()))
+        words = ["--f-number", "11", "--focus-distance", "1.8", "--depths", "1.8", "--fidelity", "draft"]
+        assert main(["psf", "--lens", str(tmp_path / "lens.zmx"), *words, "-o", str(tmp_path / "a.png")]) == 0
+        told = capsys.readouterr().out
+        assert "doublet: 100 mm f/11, focus at 1.8 m, field to 10.5 mm" in told
+
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
+            (["--lens", "a.zmx"], "a.zmx must say its largest field, in angles or in heights on the sensor"),
+            (["--lens", "a.zmx", "--focal-length", "0.04"], "the lens a.zmx has its own: leave out --focal-length"),
+            (["--lens", "b.zmx"], "cannot read b.zmx: it must have an object, surfaces and a sensor, got 0 of them"),
             ([], "there is no camera: give CAMERA, --lens, or both"),
             (["--lens", "single-5mm"], "--lens must be one of 'double-gauss-50mm', 'triplet-50mm'"),
             (["--lens", "single-50mm", "--focal-length", "0.04"], "has its own: leave out --focal-length"),
@@ -116,6 +128,8 @@ class TestPsf(BaseTester):
     def test_exception_one_sentence_of_a_lens(self, words, sentence, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "a.lens").write_bytes(b"no lens")
+        (tmp_path / "a.zmx").write_text(zemax(doublet()).replace("YFLN 0 3.0 6.0", ""))
+        (tmp_path / "b.zmx").write_text("no lens")
         save_file(TiDyOptics(fidelity="draft").state_dict(), tmp_path / "camera.safetensors")
         assert main(["psf", *words]) == 2
         error = capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Damaged prescriptions, files of optical programs, Zernike tables and lenses: ``python -m tests.optics.lens.mutate --count 2000``.
+"""Damaged lenses, in every form that they come in: ``python -m tests.optics.lens.mutate --count 2000``.
 
 Each must be accepted, with finite numbers, or be refused in one sentence by a ``ValueError`` or ``TypeError``.
 """
@@ -55,8 +55,8 @@ WORDS = (
 
 PROGRAM_WORDS = (
     *WORDS, "INFINITY", "SURF", "STOP", "TYPE", "COORDBRK", "EVENASPH", "GLAS", "MIRROR", "___BLANK", "XDAT", "UNIT",
-    "IN", "CURV", "DISZ", "PARM", "S", "SO", "SI", "STO", "ASP", "K", "A", "CIR", "REFL", "500.500", "PRV", "RDM", "DIM",
-    "{", "}", "[", "null", "true", "1e-300", "1e300", "9" * 400,
+    "IN", "CURV", "DISZ", "PARM", "S", "SO", "SI", "STO", "ASP", "K", "A", "CIR", "REFL", "500.500", "PRV", "RDM",
+    "DIM", "{", "}", "[", "null", "true", "1e-300", "1e300", "9" * 400,
 )  # fmt: skip
 
 
@@ -73,7 +73,9 @@ def mutated(value: Any, draw: random.Random) -> Any:
     """The value with one to three entries replaced, removed, scaled, doubled or moved."""
     value = copy.deepcopy(value)
     for _ in range(draw.choice((1, 1, 1, 2, 3))):
-        path = draw.choice(list(places(value)))
+        if not (known := list(places(value))):
+            break
+        path = draw.choice(known)
         owner = value
         for key in path[:-1]:
             owner = owner[key]

@@ -155,7 +155,7 @@ class TestPrescriptionFiles(BaseTester):
             ("DISZ 6.0", "DISZ -6.0", "the distance behind surface 2 must not be negative, got -6"),
             ("DISZ 6.0", "DISZ nan", "DISZ of surface 2 must be a finite number, got 'nan'"),
             ("DIAM 12.0", "SQAP 3 3\r\n  DIAM 12.0", "surface 2 has 'SQAP', which is not read"),
-            ("DIAM 12.0", "OBDC 0 1.5\r\n  DIAM 12.0", "aperture of surface 2 must stand about the axis, got OBDC 0 1.5"),
+            ("DIAM 12.0", "OBDC 0 1.5\r\n  DIAM 12.0", "surface 2 must stand about the axis, got OBDC 0 1.5"),
             ("DIAM 12.0", "CLAP 1 12\r\n  DIAM 12.0", "aperture of surface 2 must be a disc, got CLAP 1 12"),
             ("DIAM 12.0", "XDAT 1 4.0\r\n  DIAM 12.0", "surface 2 has extra data"),
         ],

@@ -40,7 +40,9 @@ def doublet() -> dict[str, Any]:
             {"R": -129.94, "t": 0.0, "r": 12.0},
         ],
         "index": {
-            "N-BK7": {"sellmeier": [(1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)]},
+            "N-BK7": {
+                "sellmeier": [(1.03961212, 0.00600069867), (0.231792344, 0.0200179144), (1.01046945, 103.560653)]
+            },
             "N-SF5": {"sellmeier": [(1.52481889, 0.011254756), (0.187085527, 0.0588995392), (1.42729015, 129.141675)]},
         },
     }
@@ -80,7 +82,7 @@ def zemax(prescription: dict[str, Any], unit: str = "MM", shift: float = 0.0) ->
         powers = row.get("poly") or {}
         lines += [f"SURF {i + 1}"] + ["  STOP"] * (row.get("kind") == "stop")
         lines += [f"  TYPE {'EVENASPH' if powers else 'STANDARD'}"]
-        lines += [f"  CURV {1 / (row['R'] * size) if row.get('R') else 0.0!r} 0 0 0 0 \"\"", "  HIDE 0 0 0"]
+        lines += [f'  CURV {1 / (row["R"] * size) if row.get("R") else 0.0!r} 0 0 0 0 ""', "  HIDE 0 0 0"]
         lines += [f"  CONI {row['k']!r}"] if row.get("k") else []
         lines += [f"  PARM {power // 2} {value * size ** (1 - power)!r}" for power, value in powers.items()]
         lines += [f"  DISZ {gap * size!r}"]
@@ -88,8 +90,8 @@ def zemax(prescription: dict[str, Any], unit: str = "MM", shift: float = 0.0) ->
             index = prescription["index"][glass]
             model = f"___BLANK 1 0 {index['nd']} {index['vd']} 0 0 0 0 0 0" if "nd" in index else f"{glass} 0 0 1.5 40"
             lines += [f"  GLAS {model}"]
-        lines += [f"  DIAM {row['r'] * size!r} 1 0 0 1 \"\""] if row.get("r") else ["  DIAM 3.0 0 0 0 1 \"\""]
-    lines += [f"SURF {len(rows) + 1}", "  TYPE STANDARD", "  CURV 0.0 0 0 0 0 \"\"", "  DISZ 0", "TOL TOFF 0 0"]
+        lines += [f'  DIAM {row["r"] * size!r} 1 0 0 1 ""'] if row.get("r") else ['  DIAM 3.0 0 0 0 1 ""']
+    lines += [f"SURF {len(rows) + 1}", "  TYPE STANDARD", '  CURV 0.0 0 0 0 0 ""', "  DISZ 0", "TOL TOFF 0 0"]
     return "\r\n".join(lines) + "\r\n"
 
 
