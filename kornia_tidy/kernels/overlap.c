@@ -11,6 +11,9 @@
 //
 // Layers are given as in scene.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one.
 //
+// PSFs that vary over the field are known at nodes. In a tile they are h0 + x hx + y hy, with x and y from its middle: see
+// below, "PSFs over the field".
+//
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
 #include <math.h>
@@ -46,6 +49,12 @@ typedef struct {
     const REAL *plane;             // (images, channels, height + side - 1, width + side - 1); not for scatter
     const REAL *pixels;            // (images, channels, height, width); not for gather
     REAL *out;                     // gather: as pixels; scatter: as the plane, zeros; gradient: as the PSFs, zeros
+    // Where PSFs are known over the field. Without nodes they are the same everywhere, and tiles are as large as fit.
+    int64_t node_rows, node_columns;           // psfs: (node_rows, node_columns, layers, channels, side, side)
+    int64_t down, across;                      // rows and columns of tiles
+    const int64_t *row_edges, *column_edges;   // (down + 1,), (across + 1,): where tiles begin, and the end
+    const REAL *row_middles, *column_middles;  // (down,), (across,): where slopes begin
+    const REAL *row_weights, *column_weights;  // (down, 2, node_rows), (across, 2, node_columns): of nodes, and slopes
 } tiles;
 
 // One stage of a transform: `length` samples are cut into `radix` interleaved ones.
@@ -239,11 +248,18 @@ INLINE int thread_number(void) {
 #endif
 }
 
+// The numbers of the lanes.
+INLINE vec steps(void) {
+    vec x;
+    for (int i = 0; i < LANES; i++) x[i] = i;
+    return x;
+}
+
 // What all windows of one call share.
 typedef struct {
     const tiles *s;
-    int64_t tile_rows, tile_columns;                // pixels of a tile
     int64_t down, across, tiles;                    // tiles of an image
+    const int64_t *row_edges, *column_edges;        // (down + 1,), (across + 1,): where tiles begin, and the end
     int64_t groups, bands, waves;                   // LANES columns of waves, LANES rows, waves in a row
     transform in_rows, in_columns;
     REAL scale;                                     // of a transform there and back
@@ -258,6 +274,13 @@ typedef struct {
 typedef struct {
     vec *light, *label, *weight, *sums;
     wave *spectrum, *total, *half, *row;
+    // Over the field only. PSFs are (psf_groups, side) vectors.
+    vec *lines;         // (2, node columns, layers, PSF): at the nodes' columns in a row of tiles, and slopes along it
+    uint8_t *has_line;  // (layers,)
+    int64_t line_row;   // of tiles
+    vec *samples;       // (TERMS, PSF)
+    wave *moments;      // (2, bands, waves): spectra of light times x and times y
+    wave *psf;          // (TERMS, bands, waves)
 } desk;
 
 // A tile: its image, its number there, its first pixel, and how much of it lies in the image.
@@ -266,8 +289,8 @@ typedef struct {
 } tile;
 
 INLINE tile tile_at(const work *w, int64_t image, int64_t number) {
-    const int64_t top = number / w->across * w->tile_rows, left = number % w->across * w->tile_columns;
-    return (tile){image, number, top, left, least(w->tile_rows, w->s->height - top), least(w->tile_columns, w->s->width - left)};
+    const int64_t *row = w->row_edges + number / w->across, *column = w->column_edges + number % w->across;
+    return (tile){image, number, row[0], column[0], row[1] - row[0], column[1] - column[0]};
 }
 
 INLINE uint8_t *needed_by(const work *w, tile t, int64_t layer) {
@@ -283,17 +306,37 @@ static void columns_to_rows(const work *w, int64_t g, wave *column, wave *spectr
         transpose(column + band * LANES, spectrum + band * w->waves + g * LANES);
 }
 
-// The spectrum of a plane of numbers.
-static void analyse(const work *w, const vec *light, wave *column, wave *spectrum) {
-    const int64_t rows = w->s->rows;
+enum { PLAIN, TIMES_X, TIMES_Y };
+
+// The spectrum of the first rows of a plane of numbers, in the first columns; or of the numbers times their distance from
+// a column or a row of the window.
+INLINE void analyse_times(const work *w, const vec *light, int64_t pitch, int64_t height, int64_t groups, int what,
+                          REAL middle, wave *column, wave *spectrum) {
     for (int64_t g = 0; g < w->groups; g++) {
-        const vec *left = light + g * rows, *right = left + w->groups * rows;
+        if (g >= groups) {
+            for (int64_t band = 0; band < w->bands; band++)
+                memset(spectrum + band * w->waves + g * LANES, 0, LANES * sizeof(wave));
+            continue;
+        }
+        const vec *left = light + g * pitch, *right = left + w->groups * pitch;
+        const vec x = steps() + (g * LANES - middle), z = x + (REAL)(w->groups * LANES);
         const wave turn = w->turns[g];
-        for (int64_t y = 0; y < rows; y++)
-            column[y] = (wave){left[y] * turn.re - right[y] * turn.im, left[y] * turn.im + right[y] * turn.re};
+        const int both = g + w->groups < groups;
+        for (int64_t y = 0; y < height; y++) {
+            vec a = left[y], b = both ? right[y] : (vec){0};
+            if (what == TIMES_X) a *= x, b *= z;
+            if (what == TIMES_Y) a *= y - middle, b *= y - middle;
+            column[y] = (wave){a * turn.re - b * turn.im, a * turn.im + b * turn.re};
+        }
+        memset(column + height, 0, (w->s->rows - height) * sizeof(wave));
         columns_to_rows(w, g, column, spectrum);
     }
     for (int64_t band = 0; band < w->bands; band++) forward(spectrum + band * w->waves, &w->in_rows);
+}
+
+// The spectrum of a plane of numbers.
+static void analyse(const work *w, const vec *light, wave *column, wave *spectrum) {
+    analyse_times(w, light, w->s->rows, w->s->rows, 2 * w->groups, PLAIN, 0, column, spectrum);
 }
 
 // Multiplies by the spectrum of a PSF, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
@@ -374,6 +417,11 @@ INLINE vec share(const tiles *s, vec label, const vec *weight, int64_t layer) {
     return where(label == (REAL)layer, 1 - *weight) + where(label == (REAL)(layer - 1), *weight);
 }
 
+// The left (0) or right (1) columns that a wave was made of.
+INLINE vec unturned(wave x, wave turn, int side) {
+    return side ? x.im * turn.re - x.re * turn.im : x.re * turn.re + x.im * turn.im;
+}
+
 // Adds the light of a column of waves and its layer's share to the sums of a tile.
 INLINE void add_shares(const work *w, tile t, int64_t layer, int64_t g, const wave *column, desk *d) {
     const tiles *s = w->s;
@@ -381,9 +429,23 @@ INLINE void add_shares(const work *w, tile t, int64_t layer, int64_t g, const wa
     for (int64_t y = s->origin; y < s->origin + t.height; y++) {
         const int64_t n = g * s->rows + y, m = n + w->groups * s->rows;
         const wave x = column[y];
-        d->sums[n] += share(s, d->label[n], d->weight + n, layer) * (x.re * turn.re + x.im * turn.im);
-        d->sums[m] += share(s, d->label[m], d->weight + m, layer) * (x.im * turn.re - x.re * turn.im);
+        d->sums[n] += share(s, d->label[n], d->weight + n, layer) * unturned(x, turn, 0);
+        d->sums[m] += share(s, d->label[m], d->weight + m, layer) * unturned(x, turn, 1);
     }
+}
+
+// Writes the sums of a tile to its pixels.
+static void write_sums(const work *w, tile t, int64_t channel, const desk *d) {
+    const tiles *s = w->s;
+    REAL *out = s->out + ((t.image * s->channels + channel) * s->height + t.top) * s->width + t.left;
+    for (int64_t y = 0; y < t.height; y++)
+        for (int64_t x = 0, column = s->origin; x < t.width;) {
+            const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
+            const REAL *from = (const REAL *)(d->sums + column / LANES * s->rows + s->origin + y) + lane;
+            if (count == LANES) memcpy(out + y * s->width + x, from, sizeof(vec));
+            else memcpy(out + y * s->width + x, from, count * sizeof(REAL));
+            x += count, column += count;
+        }
 }
 
 static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
@@ -409,15 +471,7 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
                 add_shares(w, t, layer, g, d->half + g * rows, d);
             }
     }
-    REAL *out = s->out + ((t.image * s->channels + channel) * s->height + t.top) * s->width + t.left;
-    for (int64_t y = 0; y < t.height; y++)
-        for (int64_t x = 0, column = s->origin; x < t.width;) {
-            const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
-            const REAL *from = (const REAL *)(d->sums + column / LANES * rows + s->origin + y) + lane;
-            if (count == LANES) memcpy(out + y * s->width + x, from, sizeof(vec));
-            else memcpy(out + y * s->width + x, from, count * sizeof(REAL));
-            x += count, column += count;
-        }
+    write_sums(w, t, channel, d);
 }
 
 // The transformed columns of a layer's share of the pixels, which lie in `sums`. Its rows are left to be transformed.
@@ -443,14 +497,15 @@ static void layer_columns(const work *w, tile t, int64_t layer, desk *d) {
     }
 }
 
-// Adds the first numbers of each row of a wave's columns to a plane.
-static void add_columns(const work *w, int64_t g, const wave *column, int64_t height, int64_t width, REAL *out, int64_t pitch) {
+// Adds the first numbers of each row of a wave's columns to a plane, and `sloped` ones times x from a column of the window.
+INLINE void add_columns(const work *w, int64_t g, const wave *column, const wave *sloped, REAL middle, int64_t height,
+                        int64_t width, REAL *out, int64_t pitch) {
     const wave turn = w->turns[g];
     for (int side = 0; side < 2; side++) {
         const int64_t first = (g + side * w->groups) * LANES, count = least(LANES, width - first);
         for (int64_t y = 0; count > 0 && y < height; y++) {
-            const wave x = column[y];
-            const vec value = side ? x.im * turn.re - x.re * turn.im : x.re * turn.re + x.im * turn.im;
+            vec value = unturned(column[y], turn, side);
+            if (sloped) value += (steps() + (first - middle)) * unturned(sloped[y], turn, side);
             REAL *target = out + y * pitch + first;
             vec there = {0};
             if (count == LANES) {
@@ -488,7 +543,7 @@ static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
     REAL *out = s->out + ((t.image * s->channels + channel) * height + t.top) * width + t.left;
     for (int64_t g = 0; g < w->groups; g++) {
         backward(d->half + g * s->rows, &w->in_columns);
-        add_columns(w, g, d->half + g * s->rows, t.height + s->side - 1, t.width + s->side - 1, out, width);
+        add_columns(w, g, d->half + g * s->rows, 0, 0, t.height + s->side - 1, t.width + s->side - 1, out, width);
     }
 }
 
@@ -511,6 +566,258 @@ static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave
             else multiply(row, d->total + k, w->waves, -1, 1, found + k);
         }
     }
+}
+
+// ---------------------------------------------------------------------- PSFs over the field
+//
+// The PSF of a pixel is h0 + x hx + y hy, with its distance x, y from the middle of its tile. What stands before the sum
+// of gather, x (L * hx) = (xL) * hx + L * (k hx) with a PSF's own coordinate k, leaves one transform back for each layer:
+//
+//     L * (h0 + k_x hx + k_y hy) + (xL) * hx + (yL) * hy
+//
+// Scatter is its transpose: x and y follow the sum over the layers of a tile. Nodes are blended along their columns once
+// for each row of tiles, then along this row for each tile.
+
+enum { TERMS = 3 };  // h0 + k_x hx + k_y hy, hx and hy
+
+INLINE int64_t psf_groups(const tiles *s) { return (s->side + LANES - 1) / LANES; }
+INLINE int64_t psf_vectors(const tiles *s) { return psf_groups(s) * s->side; }
+
+INLINE const REAL *row_weights(const work *w, tile t) { return w->s->row_weights + t.number / w->across * 2 * w->s->node_rows; }
+INLINE const REAL *column_weights(const work *w, tile t) {
+    return w->s->column_weights + t.number % w->across * 2 * w->s->node_columns;
+}
+
+INLINE int any(const REAL *numbers, int64_t count) {
+    for (int64_t n = 0; n < count; n++)
+        if (numbers[n] != 0) return 1;
+    return 0;
+}
+
+// Which terms a tile has: bits 1 << PLAIN, 1 << TIMES_X and 1 << TIMES_Y.
+static int terms_of(const work *w, tile t) {
+    const tiles *s = w->s;
+    return 1 << PLAIN | any(column_weights(w, t) + s->node_columns, s->node_columns) << TIMES_X |
+           any(row_weights(w, t) + s->node_rows, s->node_rows) << TIMES_Y;
+}
+
+INLINE int has(int terms, int term) { return terms >> term & 1; }
+
+// Row or column of the window from which x or y is counted.
+INLINE REAL middle_of(const work *w, tile t, int what) {
+    const tiles *s = w->s;
+    const REAL middle = what == TIMES_X ? s->column_middles[t.number % w->across] - t.left
+                                        : s->row_middles[t.number / w->across] - t.top;
+    return middle + s->side / 2;
+}
+
+INLINE vec *line_at(const work *w, desk *d, int slope, int64_t column, int64_t layer) {
+    return d->lines + ((slope * w->s->node_columns + column) * w->s->layers + layer) * psf_vectors(w->s);
+}
+
+static void begin_row(const work *w, desk *d, int64_t row) {
+    if (d->line_row == row) return;
+    d->line_row = row;
+    memset(d->has_line, 0, w->s->layers);
+}
+
+// Blends the nodes along their columns for a row of tiles, scaled for a transform there and back.
+static void blend_rows(const work *w, tile t, int64_t channel, int64_t layer, int terms, desk *d) {
+    const tiles *s = w->s;
+    const REAL *weights = row_weights(w, t);
+    const int64_t next = s->node_columns * s->layers * s->channels * s->side * s->side;
+    if (d->has_line[layer]) return;
+    d->has_line[layer] = 1;
+    for (int64_t column = 0; column < s->node_columns; column++)
+        for (int slope = 0; slope < has(terms, TIMES_Y) + 1; slope++) {
+            vec *line = line_at(w, d, slope, column, layer);
+            const REAL *psf = s->psfs + ((column * s->layers + layer) * s->channels + channel) * s->side * s->side;
+            for (int64_t g = 0; g < psf_groups(s); g++)
+                for (int64_t y = 0; y < s->side; y++) {
+                    const REAL *from = psf + y * s->side + g * LANES;
+                    const int64_t count = least(LANES, s->side - g * LANES);
+                    vec sum = {0};
+                    for (int64_t n = 0; n < s->node_rows; n++) {
+                        vec x = {0};
+                        if (count == LANES) memcpy(&x, from + n * next, sizeof x);
+                        else memcpy(&x, from + n * next, count * sizeof(REAL));
+                        sum += weights[slope * s->node_rows + n] * w->scale * x;
+                    }
+                    line[g * s->side + y] = sum;
+                }
+        }
+}
+
+// The sign of k: PSFs are convolved with the light, or correlated.
+INLINE REAL direction(const tiles *s) { return s->origin ? 1 : -1; }
+
+// Makes the spectra of a layer's PSF in a tile, one for each term.
+static void tile_psfs(const work *w, tile t, int64_t channel, int64_t layer, int terms, desk *d) {
+    const tiles *s = w->s;
+    const int64_t count = psf_vectors(s), all = w->bands * w->waves, columns = s->node_columns;
+    const int64_t next = line_at(w, d, 0, 1, 0) - line_at(w, d, 0, 0, 0);
+    const REAL *weights = column_weights(w, t), *x_weights = weights + columns, radius = s->side / 2;
+    blend_rows(w, t, channel, layer, terms, d);
+    const vec *line = line_at(w, d, 0, 0, layer), *slope = line_at(w, d, 1, 0, layer);
+    for (int64_t g = 0, n = 0; g < psf_groups(s); g++)
+        for (int64_t y = 0; y < s->side; y++, n++) {
+            vec h = {0}, x = {0}, v = {0};
+            for (int64_t c = 0; c < columns; c++) {
+                h += weights[c] * line[c * next + n];
+                if (has(terms, TIMES_X)) x += x_weights[c] * line[c * next + n];
+                if (has(terms, TIMES_Y)) v += weights[c] * slope[c * next + n];
+            }
+            d->samples[n] = h + direction(s) * ((steps() + (g * LANES - radius)) * x + (y - radius) * v);
+            d->samples[TIMES_X * count + n] = x, d->samples[TIMES_Y * count + n] = v;
+        }
+    for (int term = 0; term < TERMS; term++)
+        if (has(terms, term))
+            analyse_times(w, d->samples + term * count, s->side, s->side, psf_groups(s), PLAIN, 0, d->half, d->psf + term * all);
+}
+
+// Makes the spectra of a plane of light, and of the light times x and times y.
+static void analyse_moments(const work *w, tile t, int terms, desk *d, wave *spectrum) {
+    const int64_t rows = w->s->rows, all = w->bands * w->waves;
+    analyse(w, d->light, d->half, spectrum);
+    if (has(terms, TIMES_X))
+        analyse_times(w, d->light, rows, rows, 2 * w->groups, TIMES_X, middle_of(w, t, TIMES_X), d->half, d->moments);
+    if (has(terms, TIMES_Y))
+        analyse_times(w, d->light, rows, rows, 2 * w->groups, TIMES_Y, middle_of(w, t, TIMES_Y), d->half, d->moments + all);
+}
+
+static void gather_over_field(const work *w, int64_t channel, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t rows = s->rows, all = w->bands * w->waves;
+    const int terms = terms_of(w, t);
+    const REAL sign = s->correlate ? -1 : 1;
+    cut_window(w, t, channel, d->light);
+    analyse_moments(w, t, terms, d, d->spectrum);
+    read_labels(w, t, d);
+    memset(d->sums, 0, 2 * w->groups * rows * sizeof(vec));
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        const uint8_t *needed = needed_by(w, t, layer);
+        if (!any_of(needed, w->groups)) continue;
+        tile_psfs(w, t, channel, layer, terms, d);
+        for (int64_t band = 0; band < w->bands; band++) {
+            const int64_t k = band * w->waves;
+            multiply(d->spectrum + k, d->psf + k, w->waves, sign, 0, d->row);
+            for (int term = TIMES_X; term < TERMS; term++)
+                if (has(terms, term))
+                    multiply(d->moments + (term - 1) * all + k, d->psf + term * all + k, w->waves, sign, 1, d->row);
+            row_back(w, d->row, band, needed, d->half);
+        }
+        for (int64_t g = 0; g < w->groups; g++)
+            if (needed[g]) {
+                backward(d->half + g * rows, &w->in_columns);
+                add_shares(w, t, layer, g, d->half + g * rows, d);
+            }
+    }
+    write_sums(w, t, channel, d);
+}
+
+static void scatter_over_field(const work *w, int64_t channel, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves, half = w->groups * s->rows;
+    const int terms = terms_of(w, t);
+    const REAL sign = s->correlate ? -1 : 1;
+    wave *totals[TERMS] = {d->total, d->moments, d->moments + all};
+    cut_tile(w, t, channel, d->sums);
+    read_labels(w, t, d);
+    for (int term = 0; term < TERMS; term++)
+        if (has(terms, term)) memset(totals[term], 0, all * sizeof(wave));
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
+        tile_psfs(w, t, channel, layer, terms, d);
+        layer_columns(w, t, layer, d);
+        for (int64_t k = 0; k < all; k += w->waves) {
+            forward(d->spectrum + k, &w->in_rows);
+            for (int term = 0; term < TERMS; term++)
+                if (has(terms, term))
+                    multiply(d->spectrum + k, d->psf + term * all + k, w->waves, sign, 1, totals[term] + k);
+        }
+    }
+    const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
+    REAL *out = s->out + ((t.image * s->channels + channel) * height + t.top) * width + t.left;
+    for (int term = 0; term < TERMS; term++)
+        for (int64_t band = 0; has(terms, term) && band < w->bands; band++)
+            row_back(w, totals[term] + band * w->waves, band, 0, d->half + term * half);
+    for (int64_t g = 0; g < w->groups; g++) {
+        wave *columns[TERMS] = {0};
+        for (int term = 0; term < TERMS; term++)
+            if (has(terms, term)) backward(columns[term] = d->half + term * half + g * s->rows, &w->in_columns);
+        const REAL middle = middle_of(w, t, TIMES_Y);
+        for (int64_t y = 0; columns[TIMES_Y] && y < t.height + s->side - 1; y++) {
+            const wave x = columns[TIMES_Y][y];
+            columns[0][y] = sum(columns[0][y], (wave){x.re * (y - middle), x.im * (y - middle)});
+        }
+        add_columns(w, g, columns[0], columns[TIMES_X], middle_of(w, t, TIMES_X), t.height + s->side - 1,
+                    t.width + s->side - 1, out, width);
+    }
+}
+
+// Adds the gradient of a layer's PSF in a tile to those of the lines.
+static void correlate_over_field(const work *w, int64_t channel, tile t, desk *d) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves, half = w->groups * s->rows, count = psf_vectors(s);
+    const REAL *weights = column_weights(w, t), *x_weights = weights + s->node_columns, radius = s->side / 2;
+    const int terms = terms_of(w, t);
+    const wave *light[TERMS] = {d->total, d->moments, d->moments + all};
+    cut_window(w, t, channel, d->light);
+    analyse_moments(w, t, terms, d, d->total);
+    cut_tile(w, t, channel, d->sums);
+    read_labels(w, t, d);
+    for (int64_t layer = 0; layer < s->layers; layer++) {
+        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
+        layer_columns(w, t, layer, d);
+        for (int64_t band = 0; band < w->bands; band++) {
+            wave *row = d->spectrum + band * w->waves;
+            forward(row, &w->in_rows);
+            for (int term = 0; term < TERMS; term++) {
+                if (!has(terms, term)) continue;
+                const wave *x = light[term] + band * w->waves;
+                if (s->correlate) multiply(x, row, w->waves, -1, 0, d->row);
+                else multiply(row, x, w->waves, -1, 0, d->row);
+                row_back(w, d->row, band, 0, d->half + term * half);
+            }
+        }
+        memset(d->samples, 0, TERMS * count * sizeof(vec));
+        for (int term = 0; term < TERMS; term++)
+            for (int64_t g = 0; has(terms, term) && g < w->groups; g++) {
+                wave *column = d->half + term * half + g * s->rows;
+                if (g >= psf_groups(s)) break;
+                backward(column, &w->in_columns);
+                for (int side = 0; side < 2; side++) {
+                    const int64_t own = g + side * w->groups;
+                    for (int64_t y = 0; own < psf_groups(s) && y < s->side; y++)
+                        d->samples[term * count + own * s->side + y] = unturned(column[y], w->turns[g], side);
+                }
+            }
+        for (int64_t c = 0; c < s->node_columns; c++) {
+            vec *line = line_at(w, d, 0, c, layer), *slope = line_at(w, d, 1, c, layer);
+            if (!d->has_line[layer]) memset(line, 0, count * sizeof(vec)), memset(slope, 0, count * sizeof(vec));
+            for (int64_t g = 0, n = 0; g < psf_groups(s); g++)
+                for (int64_t y = 0; y < s->side; y++, n++) {
+                    const vec h = d->samples[n], k = direction(s) * (steps() + (g * LANES - radius));
+                    line[n] += weights[c] * h + x_weights[c] * (d->samples[TIMES_X * count + n] + k * h);
+                    slope[n] += weights[c] * (d->samples[TIMES_Y * count + n] + direction(s) * (y - radius) * h);
+                }
+        }
+        d->has_line[layer] = 1;
+    }
+}
+
+// Adds the gradients of a row of tiles to those of the nodes, (node_rows, node_columns, layers, PSF) vectors.
+static void add_lines(const work *w, int64_t row, desk *d, vec *nodes) {
+    const tiles *s = w->s;
+    const int64_t count = psf_vectors(s);
+    const REAL *weights = s->row_weights + row * 2 * s->node_rows;
+    for (int64_t layer = 0; layer < s->layers; layer++)
+        for (int64_t n = 0; d->has_line[layer] && n < s->node_rows * s->node_columns; n++) {
+            const REAL value = weights[n / s->node_columns], slope = weights[s->node_rows + n / s->node_columns];
+            const vec *line = line_at(w, d, 0, n % s->node_columns, layer), *sloped = line_at(w, d, 1, n % s->node_columns, layer);
+            vec *node = nodes + (n * s->layers + layer) * count;
+            for (int64_t k = 0; k < count; k++) node[k] += value * line[k] + slope * sloped[k];
+        }
 }
 
 // ---------------------------------------------------------------------- a call
@@ -568,12 +875,20 @@ static void transform_psfs(const work *w, int64_t channel, desk *desks) {
     }
 }
 
+// From which distance in tiles on windows do not overlap.
+static int64_t apart(const int64_t *edges, int64_t count, int64_t side) {
+    int64_t tiles = 1;
+    for (int64_t n = 0; n + tiles < count; n++)
+        while (n + tiles < count && edges[n + tiles] < edges[n + 1] + side - 1) tiles++;
+    return tiles;
+}
+
 // Gathers or scatters all tiles of a channel. Tiles whose windows overlap are not scattered at the same time, so that
 // the order of additions is always the same.
 static void render_tiles(const work *w, int64_t channel, desk *desks, int kind) {
     const tiles *s = w->s;
-    const int64_t down = kind == SCATTER ? (s->rows + w->tile_rows - 1) / w->tile_rows : 1;
-    const int64_t across = kind == SCATTER ? (s->columns + w->tile_columns - 1) / w->tile_columns : 1;
+    const int64_t down = kind == SCATTER ? apart(w->row_edges, w->down, s->side) : 1;
+    const int64_t across = kind == SCATTER ? apart(w->column_edges, w->across, s->side) : 1;
     for (int64_t phase = 0; phase < least(down, w->down) * across; phase++) {
         const int64_t y = phase / across, x = phase % across;
         const int64_t own = (w->down - y + down - 1) / down, beside = (w->across - x + across - 1) / across;
@@ -610,8 +925,61 @@ static void correlate_tiles(const work *w, int64_t channel, desk *desks, int64_t
         REAL *out = s->out + (layer * s->channels + channel) * s->side * s->side;
         for (int64_t g = 0; g < w->groups; g++) {
             backward(d->half + g * s->rows, &w->in_columns);
-            add_columns(w, g, d->half + g * s->rows, s->side, s->side, out, s->side);
+            add_columns(w, g, d->half + g * s->rows, 0, 0, s->side, s->side, out, s->side);
         }
+    }
+}
+
+// Gathers or scatters all tiles of a channel over the field, a row of tiles in one thread. Rows whose windows overlap are
+// not scattered at the same time.
+static void render_over_field(const work *w, int64_t channel, desk *desks, int kind) {
+    const tiles *s = w->s;
+    const int64_t down = kind == SCATTER ? apart(w->row_edges, w->down, s->side) : 1;
+    for (int64_t n = 0; n < s->threads; n++) desks[n].line_row = -1;
+    for (int64_t phase = 0; phase < least(down, w->down); phase++) {
+        const int64_t own = (w->down - phase + down - 1) / down;
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+        for (int64_t n = 0; n < s->images * own; n++) {
+            const int64_t row = n / s->images * down + phase;
+            desk *d = desks + thread_number();
+            begin_row(w, d, row);
+            for (int64_t column = 0; column < w->across; column++) {
+                const tile t = tile_at(w, n % s->images, row * w->across + column);
+                if (kind == SCATTER) scatter_over_field(w, channel, t, d);
+                else gather_over_field(w, channel, t, d);
+            }
+        }
+    }
+}
+
+// Correlates all rows of tiles of a channel over the field, a slab of them in each thread; then the slabs are added.
+static void correlate_rows(const work *w, int64_t channel, desk *desks) {
+    const tiles *s = w->s;
+    const int64_t nodes = s->node_rows * s->node_columns * s->layers, count = psf_vectors(s);
+    vec *slabs = (vec *)w->psfs;
+    memset(slabs, 0, s->threads * nodes * count * sizeof(vec));
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+    for (int64_t slab = 0; slab < s->threads; slab++) {
+        desk *d = desks + thread_number();
+        for (int64_t row = w->down * slab / s->threads; row < w->down * (slab + 1) / s->threads; row++) {
+            d->line_row = -1;
+            begin_row(w, d, row);
+            for (int64_t n = 0; n < s->images * w->across; n++)
+                correlate_over_field(w, channel, tile_at(w, n / w->across, row * w->across + n % w->across), d);
+            add_lines(w, row, d, slabs + slab * nodes * count);
+        }
+    }
+#pragma omp parallel for num_threads(s->threads)
+    for (int64_t n = 0; n < nodes; n++) {
+        vec *found = slabs + n * count;
+        REAL *out = s->out + (n * s->channels + channel) * s->side * s->side;
+        for (int64_t slab = 1; slab < s->threads; slab++)
+            for (int64_t k = 0; k < count; k++) found[k] += found[slab * nodes * count + k];
+        for (int64_t g = 0; g < psf_groups(s); g++)
+            for (int64_t y = 0; y < s->side; y++) {
+                const vec x = found[g * s->side + y] * w->scale;
+                memcpy(out + y * s->side + g * LANES, &x, least(LANES, s->side - g * LANES) * sizeof(REAL));
+            }
     }
 }
 
@@ -634,9 +1002,16 @@ static int take_desk(const work *w, desk *d) {
     d->sums = take(plane, sizeof(vec));
     d->spectrum = take(waves, sizeof(wave));
     d->total = take(waves, sizeof(wave));
-    d->half = take(w->groups * w->s->rows, sizeof(wave));
+    d->half = take((w->s->node_rows ? TERMS : 1) * w->groups * w->s->rows, sizeof(wave));
     d->row = take(w->waves, sizeof(wave));
-    return d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
+    const int taken = d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
+    if (!w->s->node_rows) return taken;
+    d->lines = take(2 * w->s->node_columns * w->s->layers * psf_vectors(w->s), sizeof(vec));
+    d->has_line = take(w->s->layers, 1);
+    d->samples = take(TERMS * psf_vectors(w->s), sizeof(vec));
+    d->moments = take(2 * waves, sizeof(wave));
+    d->psf = take(TERMS * waves, sizeof(wave));
+    return taken && d->lines && d->has_line && d->samples && d->moments && d->psf;
 }
 
 static void free_desk(desk *d) {
@@ -648,6 +1023,11 @@ static void free_desk(desk *d) {
     free(d->total);
     free(d->half);
     free(d->row);
+    free(d->lines);
+    free(d->has_line);
+    free(d->samples);
+    free(d->moments);
+    free(d->psf);
 }
 
 // Computes in memory that was taken. Returns as the functions below.
@@ -659,25 +1039,40 @@ static int compute_in(work *w, desk *desks, int kind) {
         w->turns[j / LANES].re[j % LANES] = cos(M_PI * (double)j / (double)s->columns);
         w->turns[j / LANES].im[j % LANES] = sin(M_PI * (double)j / (double)s->columns);
     }
-    const int64_t present = place_layers(w);
-    w->psfs = take(present * w->bands * w->waves * (kind == CORRELATE ? s->threads : 1), sizeof(wave));
+    const int64_t present = place_layers(w), slabs = kind == CORRELATE ? s->threads : 1;
+    if (!s->node_rows) w->psfs = take(slabs * present * w->bands * w->waves, sizeof(wave));
+    else w->psfs = take(kind == CORRELATE ? slabs * s->node_rows * s->node_columns * s->layers * psf_vectors(s) : 0, sizeof(vec));
     if (!w->psfs) return 2;
     for (int64_t channel = 0; channel < s->channels; channel++) {
-        if (kind == CORRELATE) {
-            correlate_tiles(w, channel, desks, present);
-            continue;
+        if (s->node_rows && kind == CORRELATE) correlate_rows(w, channel, desks);
+        else if (s->node_rows) render_over_field(w, channel, desks, kind);
+        else if (kind == CORRELATE) correlate_tiles(w, channel, desks, present);
+        else {
+            transform_psfs(w, channel, desks);
+            render_tiles(w, channel, desks, kind);
         }
-        transform_psfs(w, channel, desks);
-        render_tiles(w, channel, desks, kind);
     }
     free(w->psfs);
     return 0;
 }
 
+// Where tiles of so many pixels begin, and the end.
+static int64_t *even_edges(int64_t pixels, int64_t side, int64_t count) {
+    int64_t *edges = take(count + 1, sizeof(int64_t));
+    for (int64_t n = 0; edges && n <= count; n++) edges[n] = least(n * side, pixels);
+    return edges;
+}
+
 static int compute(const tiles *s, int kind) {
-    work w = {.s = s, .tile_rows = s->rows - s->side + 1, .tile_columns = s->columns - s->side + 1};
-    w.down = (s->height + w.tile_rows - 1) / w.tile_rows;
-    w.across = (s->width + w.tile_columns - 1) / w.tile_columns;
+    const int64_t height = s->rows - s->side + 1, width = s->columns - s->side + 1;  // of the largest tile
+    work w = {.s = s, .down = s->down, .across = s->across};
+    int64_t *edges[2] = {0, 0};
+    w.row_edges = s->row_edges, w.column_edges = s->column_edges;
+    if (!s->node_rows) {
+        w.down = (s->height + height - 1) / height, w.across = (s->width + width - 1) / width;
+        w.row_edges = edges[0] = even_edges(s->height, height, w.down);
+        w.column_edges = edges[1] = even_edges(s->width, width, w.across);
+    }
     w.tiles = w.down * w.across;
     w.waves = s->columns / 2, w.groups = w.waves / LANES, w.bands = s->rows / LANES;
     w.scale = 1 / ((REAL)s->rows * (REAL)w.waves);
@@ -686,7 +1081,7 @@ static int compute(const tiles *s, int kind) {
     w.place = take(s->layers, sizeof(int64_t));
     w.needed = calloc(s->images * w.tiles * s->layers, w.groups);
     desk *desks = calloc(s->threads, sizeof(desk));
-    int taken = desks && w.numbers && w.turns && w.place && w.needed;
+    int taken = desks && w.row_edges && w.column_edges && w.numbers && w.turns && w.place && w.needed;
     for (int64_t n = 0; taken && n < s->threads; n++) taken = take_desk(&w, desks + n);
     const int failed = taken ? compute_in(&w, desks, kind) : 2;
     for (int64_t n = 0; desks && n < s->threads; n++) free_desk(desks + n);
@@ -695,6 +1090,8 @@ static int compute(const tiles *s, int kind) {
     free(w.turns);
     free(w.place);
     free(w.needed);
+    free(edges[0]);
+    free(edges[1]);
     return failed;
 }
 

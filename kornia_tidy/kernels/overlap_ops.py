@@ -6,14 +6,17 @@ plane L, in the pixels I and in the PSFs h:
 .. math:: T = \sum_{c d y} I_c(y) \, w_d(y) \, (L_c * h_{dc})(y)
 
 :func:`gather_overlap` is its derivative to I, :func:`scatter_overlap` to L and :func:`overlap_psf_gradient` to h.
+
+PSFs may vary over the field, see :class:`Places`: the PSF of a pixel y is then that of its tile, to first order.
 """
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from functools import cache
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,6 +45,28 @@ def window_size(psf_side: int) -> int:
     return next(size for size in sizes if is_window_size(size, torch.float32))
 
 
+class Places(NamedTuple):
+    r"""Tiles of a picture with PSFs that are known at nodes over the field, along rows and along columns.
+
+    .. math:: h(y, x) = \sum_{ij} \left( a_i b_j + (y - y_0) \, a'_i b_j + (x - x_0) \, a_i b'_j \right) h_{ij}
+
+    Args:
+        row_edges: first row of each row of tiles and the end of the last, (R + 1,) int64 on a processor.
+        row_middles: :math:`y_0` of each row of tiles, (R,) float64.
+        row_weights: :math:`a_i` and :math:`a'_i` of each row of tiles, (R, 2, I) float64.
+        column_edges: the same along columns.
+        column_middles: as above.
+        column_weights: :math:`b_j` and :math:`b'_j`, (S, 2, J).
+    """
+
+    row_edges: Tensor
+    row_middles: Tensor
+    row_weights: Tensor
+    column_edges: Tensor
+    column_middles: Tensor
+    column_weights: Tensor
+
+
 def gather_overlap(
     plane: Tensor,
     psfs: Tensor,
@@ -51,6 +76,7 @@ def gather_overlap(
     *,
     correlate: bool = False,
     weight_gradient: bool = False,
+    places: Sequence[Tensor] = (),
 ) -> Tensor:
     r"""Convolve a plane with the PSFs of each pixel's layers and blend them: operator ``kornia_tidy::gather_overlap``.
 
@@ -60,12 +86,13 @@ def gather_overlap(
 
     Args:
         plane: L, (B, C, H + P - 1, W + P - 1) light on a processor, float32 or float64.
-        psfs: h, (D, C, P, P) with P odd, of the plane's dtype.
+        psfs: h, (D, C, P, P) with P odd, of the plane's dtype; with ``places`` (I, J, D, C, P, P).
         layer_index: d, (B, H, W) int64.
         layer_weight: t, share of the next layer in [0, 1], (B, H, W) of the plane's dtype, or None for zero.
         size: side of a window in samples, see :func:`~kornia_tidy.kernels.window_sides.is_window_size`, at least P.
         correlate: with PSFs that are flipped by 180 degrees.
         weight_gradient: return :math:`\partial I_c / \partial t` instead.
+        places: :class:`Places` of PSFs that vary over the field. Default: they are the same everywhere.
 
     Returns:
         (B, C, H, W). It has no gradient.
@@ -78,7 +105,7 @@ def gather_overlap(
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.gather_overlap(
-        plane, psfs, layer_index, layer_weight, size, correlate, weight_gradient
+        plane, psfs, layer_index, layer_weight, size, correlate, weight_gradient, list(places)
     )
 
 
@@ -90,6 +117,7 @@ def scatter_overlap(
     size: int,
     *,
     correlate: bool = False,
+    places: Sequence[Tensor] = (),
 ) -> Tensor:
     """Spread the light of pixels by the PSFs of their layers: the transpose of :func:`gather_overlap`, by overlap-add.
 
@@ -101,12 +129,14 @@ def scatter_overlap(
         size: side of a window in samples.
         correlate: with PSFs that are flipped. The gradient of :func:`gather_overlap` with respect to its plane takes
             the opposite of what that took.
+        places: as there.
 
     Returns:
         (B, C, H + P - 1, W + P - 1) light, added in the same order every time. It has no gradient. Errors are those of
         :func:`gather_overlap`.
     """
-    return torch.ops.kornia_tidy.scatter_overlap(pixels, psfs, layer_index, layer_weight, size, correlate)
+    labels = layer_index, layer_weight
+    return torch.ops.kornia_tidy.scatter_overlap(pixels, psfs, *labels, size, correlate, list(places))
 
 
 def overlap_psf_gradient(
@@ -118,6 +148,7 @@ def overlap_psf_gradient(
     size: int,
     *,
     correlate: bool = False,
+    places: Sequence[Tensor] = (),
 ) -> Tensor:
     """Correlate a plane with each layer's pixels: the gradient of :func:`gather_overlap` with respect to the PSFs.
 
@@ -129,12 +160,14 @@ def overlap_psf_gradient(
         layers: number of layers D.
         size: side of a window in samples.
         correlate: as there.
+        places: as there.
 
     Returns:
-        (D, C, P, P), added in the same order every time with as many threads. It has no gradient. Errors are those of
+        (D, C, P, P), or with ``places`` (I, J, D, C, P, P), added in the same order every time with as many threads. It has no gradient. Errors are those of
         :func:`gather_overlap`.
     """
-    return torch.ops.kornia_tidy.overlap_psf_gradient(plane, pixels, layer_index, layer_weight, layers, size, correlate)
+    labels = layer_index, layer_weight
+    return torch.ops.kornia_tidy.overlap_psf_gradient(plane, pixels, *labels, layers, size, correlate, list(places))
 
 
 class _Tiles(Parameters):
@@ -147,35 +180,47 @@ class _Tiles(Parameters):
         *((name, ctypes.c_int64) for name in ("pixels_image", "pixels_channel", "pixels_row")),
         *((name, ctypes.c_int64) for name in ("index_image", "index_row", "weight_image", "weight_row")),
         *((name, ctypes.c_void_p) for name in ("psfs", "index", "weight", "plane", "pixels", "out")),
+        *((name, ctypes.c_int64) for name in ("node_rows", "node_columns", "down", "across")),
+        *((name, ctypes.c_void_p) for name in ("row_edges", "column_edges", "row_middles", "column_middles")),
+        *((name, ctypes.c_void_p) for name in ("row_weights", "column_weights")),
     )
 
 
 def _call(
     function: str,
     out: Tensor,
-    side: int,
-    layers: int,
+    like_psfs: Tensor,
     labels: tuple[Tensor, Tensor | None],
     size: int,
     correlate: bool,
-    weight_gradient: bool = False,
+    weight_gradient: bool,
+    places: list[Tensor],
     **tensors: Tensor,
 ) -> Tensor:
     """Call a function of overlap.c that writes to ``out``, and return it."""
-    images, height, width = labels[0].shape
-    step = size_step(out.dtype)
+    (images, height, width), (layers, channels, side, _) = labels[0].shape, like_psfs.shape[-4:]
+    step, largest, own = size_step(out.dtype), (height, width), {}
+    if places:
+        given = Places(*places)
+        for edges, pixels in ((given.row_edges, height), (given.column_edges, width)):
+            _check_edges(edges, pixels, size - side + 1)
+        largest = int(given.row_edges.diff().max()), int(given.column_edges.diff().max())
+        own = {"node_rows": like_psfs.shape[0], "node_columns": like_psfs.shape[1]}
+        own |= {"down": len(given.row_middles), "across": len(given.column_middles)}
+        tensors |= {name: x if x.dtype == torch.int64 else x.to(out.dtype) for name, x in given._asdict().items()}
     tiles = _Tiles(
         images=images,
-        channels=out.shape[1],
+        channels=channels,
         height=height,
         width=width,
         layers=layers,
         side=side,
-        rows=needed_side(size, height, side, step // 2),
-        columns=needed_side(size, width, side, step),
+        rows=needed_side(size, largest[0], side, step // 2),
+        columns=needed_side(size, largest[1], side, step),
         origin=(side - 1) * (correlate == (function == "scatter")),
         correlate=correlate,
         weight_gradient=weight_gradient,
+        **own,
     )
     tiles.point_to(index=labels[0], weight=labels[1], out=out, **tensors)
     status = getattr(load(SOURCE, out.dtype), function)(ctypes.byref(tiles)) if images and out.numel() else 0
@@ -194,65 +239,122 @@ def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
         )
 
 
+def _check_places(places: list[Tensor], nodes: tuple[int, ...]) -> None:
+    """Refuse places whose tensors do not fit one another or the nodes. Looks at no value."""
+    given = Places(*places)
+    for axis, count in zip((given[:3], given[3:]), nodes, strict=True):
+        edges, middles, weights = axis
+        tiles = tuple(middles.shape)
+        if (tuple(edges.shape), tuple(weights.shape)) != ((len(middles) + 1,), (*tiles, 2, count)):
+            shapes = ", ".join(str(tuple(x.shape)) for x in axis)
+            raise ValueError(
+                f"places must be n + 1 edges, n middles and (n, 2, {count}) weights of nodes, got shapes {shapes}"
+            )
+
+
+def _check_edges(edges: Tensor, pixels: int, largest: int) -> None:
+    """Refuse tiles that do not cover the pixels of an axis or do not fit into windows."""
+    tiles = edges.diff()
+    if edges[0] != 0 or edges[-1] != pixels or tiles.min() < 1 or tiles.max() > largest:
+        raise ValueError(
+            f"edges of tiles must ascend from 0 to {pixels} by {largest} at most, got {edges.tolist()!s:.80}"
+        )
+
+
+def _of_axis(psfs: Tensor, places: list[Tensor]) -> Tensor:
+    """Return the PSFs of a node where there are places, and refuse wrong places."""
+    if not places:
+        return psfs
+    if psfs.ndim != 6 or 0 in psfs.shape[:2]:
+        raise ValueError(f"psfs over the field must have shape (I, J, D, C, P, P), got {tuple(psfs.shape)}")
+    _check_places(places, psfs.shape[:2])
+    return psfs[0, 0]
+
+
 def _new_pixels(
-    plane: Tensor, psfs: Tensor, index: Tensor, weight: Tensor | None, size: int, correlate: bool, weight_gradient: bool
+    plane: Tensor,
+    psfs: Tensor,
+    index: Tensor,
+    weight: Tensor | None,
+    size: int,
+    correlate: bool,
+    weight_gradient: bool,
+    places: list[Tensor],
 ) -> Tensor:
-    out = new_pixels(plane, psfs, index, weight, weight_gradient)
+    out = new_pixels(plane, _of_axis(psfs, places), index, weight, weight_gradient)
     _check_size(size, psfs.shape[-1], psfs.dtype)
     return out
 
 
 def _new_plane(
-    pixels: Tensor, psfs: Tensor, index: Tensor, weight: Tensor | None, size: int, correlate: bool
+    pixels: Tensor,
+    psfs: Tensor,
+    index: Tensor,
+    weight: Tensor | None,
+    size: int,
+    correlate: bool,
+    places: list[Tensor],
 ) -> Tensor:
-    out = new_plane(pixels, psfs, index, weight)
+    out = new_plane(pixels, _of_axis(psfs, places), index, weight)
     _check_size(size, psfs.shape[-1], psfs.dtype)
     return out
 
 
 def _new_psfs(
-    plane: Tensor, pixels: Tensor, index: Tensor, weight: Tensor | None, layers: int, size: int, correlate: bool
+    plane: Tensor,
+    pixels: Tensor,
+    index: Tensor,
+    weight: Tensor | None,
+    layers: int,
+    size: int,
+    correlate: bool,
+    places: list[Tensor],
 ) -> Tensor:
     out = new_psfs(plane, pixels, index, weight, layers)
     _check_size(size, out.shape[-1], out.dtype)
-    return out
+    if not places:
+        return out
+    nodes = Places(*places).row_weights.shape[-1], Places(*places).column_weights.shape[-1]
+    _check_places(places, nodes)
+    return out.new_zeros(*nodes, *out.shape)
 
 
 def _gather(plane: Tensor, psfs: Tensor, *rest: Any) -> Tensor:
     index, weight, *options = rest
     out = _new_pixels(plane, psfs, *rest)
-    return _call("gather", out, psfs.shape[-1], len(psfs), (index, weight), *options, plane=plane, psfs=psfs)
+    return _call("gather", out, psfs, (index, weight), *options, plane=plane, psfs=psfs)
 
 
 def _scatter(pixels: Tensor, psfs: Tensor, *rest: Any) -> Tensor:
-    index, weight, *options = rest
+    index, weight, size, correlate, places = rest
     out = _new_plane(pixels, psfs, *rest)
-    return _call("scatter", out, psfs.shape[-1], len(psfs), (index, weight), *options, pixels=pixels, psfs=psfs)
+    return _call("scatter", out, psfs, (index, weight), size, correlate, False, places, pixels=pixels, psfs=psfs)
 
 
 def _psf_gradient(plane: Tensor, pixels: Tensor, *rest: Any) -> Tensor:
-    index, weight, layers, *options = rest
+    index, weight, _, size, correlate, places = rest
     out = _new_psfs(plane, pixels, *rest)
-    return _call("correlate", out, out.shape[-1], layers, (index, weight), *options, plane=plane, pixels=pixels)
+    return _call("correlate", out, out, (index, weight), size, correlate, False, places, plane=plane, pixels=pixels)
 
 
 define(
     "gather_overlap",
     "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, SymInt size, bool correlate,"
-    " bool weight_gradient) -> Tensor",
+    " bool weight_gradient, Tensor[] places) -> Tensor",
     _gather,
     _new_pixels,
 )
 define(
     "scatter_overlap",
-    "(Tensor pixels, Tensor psfs, Tensor layer_index, Tensor? layer_weight, SymInt size, bool correlate) -> Tensor",
+    "(Tensor pixels, Tensor psfs, Tensor layer_index, Tensor? layer_weight, SymInt size, bool correlate,"
+    " Tensor[] places) -> Tensor",
     _scatter,
     _new_plane,
 )
 define(
     "overlap_psf_gradient",
     "(Tensor plane, Tensor pixels, Tensor layer_index, Tensor? layer_weight, SymInt layers, SymInt size,"
-    " bool correlate) -> Tensor",
+    " bool correlate, Tensor[] places) -> Tensor",
     _psf_gradient,
     _new_psfs,
 )

@@ -6,9 +6,10 @@ a block; layers lie in every way in which they are found (one, noise, stripes, s
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
+from kornia_tidy.kernels.overlap_ops import Places
 from kornia_tidy.kernels.window_sides import is_window_size, size_step
 from kornia_tidy.psf.energies import LARGEST_WINDOW
 from kornia_tidy.render.backends.dense import DenseBackend
@@ -87,6 +89,7 @@ class _Scene:
     fraction: Tensor | None
     about: str
     products: int
+    places: Places | None = None
 
 
 def gather(draw: random.Random) -> Call:
@@ -125,51 +128,89 @@ def correlate(draw: random.Random) -> Call:
 
 def overlap_gather(draw: random.Random) -> Call:
     """``gather`` of overlap.c."""
-    scene, size, correlate = _overlapping(draw)
+    return _overlap_gather(draw, _overlapping(draw))
+
+
+def field_gather(draw: random.Random) -> Call:
+    """``gather`` of overlap.c with PSFs that vary over the field."""
+    return _overlap_gather(draw, _over_field(draw))
+
+
+def _overlap_gather(draw: random.Random, drawn: tuple[_Scene, int, bool]) -> Call:
+    scene, size, correlate = drawn
     weight_gradient = scene.fraction is not None and draw.random() < 0.3
 
     def truth() -> tuple[Tensor, float]:
         psfs, weights = scene.psfs.double(), _weights(scene, gradient=weight_gradient)
-        expected = _mixed(scene.light.double(), psfs.flip((-2, -1)) if correlate else psfs, weights)
-        return expected, 2 * _transform_error(scene.light, scene.psfs, size)
+        expected = _placed(scene, scene.light.double(), psfs.flip((-2, -1)) if correlate else psfs, weights)
+        return expected, 2 * _overlap_error(scene, scene.light, size)
 
     arguments = scene.light, scene.psfs, scene.lower, scene.fraction, size, correlate, weight_gradient
     about = f"{scene.about} size {size} correlate {correlate} weight_gradient {weight_gradient}"
-    return Call(about, "gather_overlap", arguments, scene.products, truth)
+    return Call(about, "gather_overlap", (*arguments, _listed(scene)), scene.products, truth)
 
 
 def overlap_scatter(draw: random.Random) -> Call:
     """``scatter`` of overlap.c: the transpose of ``gather``."""
-    scene, size, correlate = _overlapping(draw)
+    return _overlap_scatter(draw, _overlapping(draw))
+
+
+def field_scatter(draw: random.Random) -> Call:
+    """``scatter`` of overlap.c with PSFs that vary over the field."""
+    return _overlap_scatter(draw, _over_field(draw))
+
+
+def _overlap_scatter(draw: random.Random, drawn: tuple[_Scene, int, bool]) -> Call:
+    scene, size, correlate = drawn
     pixels = _pixels(draw, scene)
 
     def truth() -> tuple[Tensor, float]:
         light, psfs = scene.light.double().requires_grad_(), scene.psfs.double()
-        weights = _weights(scene)
-        coded = _mixed(light, psfs if correlate else psfs.flip((-2, -1)), weights)
+        coded = _placed(scene, light, psfs if correlate else psfs.flip((-2, -1)), _weights(scene))
         expected = torch.autograd.grad((coded * pixels.double()).sum(), light)[0]
-        return expected, 4 * len(psfs) * _transform_error(pixels, scene.psfs, size)  # windows of four tiles overlap
+        layers, side = scene.psfs.shape[-4], scene.psfs.shape[-1]
+        # Windows of four tiles overlap, and of more where tiles over the field are narrow.
+        together = 4 if scene.places is None else math.prod(
+            max(2, int(((x[None] < x[:-1, None] + side - 1) & (x[None] >= x[:-1, None])).sum(1).max()) + 1)
+            for x in (scene.places.row_edges, scene.places.column_edges)
+        )
+        return expected, together * layers * _overlap_error(scene, pixels, size)
 
     arguments = pixels, scene.psfs, scene.lower, scene.fraction, size, correlate
     about = f"{scene.about} size {size} correlate {correlate}"
-    return Call(about, "scatter_overlap", arguments, scene.products, truth)
+    return Call(about, "scatter_overlap", (*arguments, _listed(scene)), scene.products, truth)
 
 
 def overlap_correlate(draw: random.Random) -> Call:
     """``correlate`` of overlap.c: the gradient of a sum over pixels to the PSFs."""
-    scene, size, correlate = _overlapping(draw)
+    return _overlap_correlate(draw, _overlapping(draw))
+
+
+def field_correlate(draw: random.Random) -> Call:
+    """``correlate`` of overlap.c: the gradient of the PSFs at the nodes of a field."""
+    return _overlap_correlate(draw, _over_field(draw))
+
+
+def _overlap_correlate(draw: random.Random, drawn: tuple[_Scene, int, bool]) -> Call:
+    scene, size, correlate = drawn
     pixels = _pixels(draw, scene)
 
-    def truth() -> tuple[Tensor, float]:
+    def truth() -> tuple[Tensor, Tensor | float]:
         psfs = scene.psfs.double().requires_grad_()
         turned = psfs.flip((-2, -1)) if correlate else psfs
-        coded = _mixed(scene.light.double(), turned, _weights(scene))
+        coded = _placed(scene, scene.light.double(), turned, _weights(scene))
         expected = torch.autograd.grad((coded * pixels.double()).sum(), psfs)[0]
-        return expected, 2 * _transform_error(scene.light, pixels, size)
+        allowed: Tensor | float = 2 * _transform_error(scene.light, pixels, size)
+        if (places := scene.places) is not None:
+            rows, columns = (
+                x.abs().amax(0)[0] + 2 * size * x.abs().amax(0)[1] for x in (places.row_weights, places.column_weights)
+            )
+            allowed = allowed * (rows[:, None] * columns)[..., None, None, None, None]
+        return expected, allowed
 
-    arguments = scene.light, pixels, scene.lower, scene.fraction, len(scene.psfs), size, correlate
+    arguments = scene.light, pixels, scene.lower, scene.fraction, scene.psfs.shape[-4], size, correlate
     about = f"{scene.about} size {size} correlate {correlate}"
-    return Call(about, "overlap_psf_gradient", arguments, scene.products, truth)
+    return Call(about, "overlap_psf_gradient", (*arguments, _listed(scene)), scene.products, truth)
 
 
 def occlude(draw: random.Random) -> Call:
@@ -473,6 +514,9 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "overlap.c: gather": overlap_gather,
     "overlap.c: scatter": overlap_scatter,
     "overlap.c: correlate": overlap_correlate,
+    "overlap.c: gather over the field": field_gather,
+    "overlap.c: scatter over the field": field_scatter,
+    "overlap.c: correlate over the field": field_correlate,
     "direct.c: gather": gather,
     "direct.c: correlate": correlate,
     "occlusion.c: light": occlude,
@@ -528,6 +572,58 @@ def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool]:
     return scene, size, draw.random() < 0.5
 
 
+def _over_field(draw: random.Random) -> tuple[_Scene, int, bool]:
+    """A scene with PSFs at nodes over the field, tiles of any sizes, the side of windows, and whether PSFs are flipped."""
+    scene, size, correlate = _overlapping(draw)
+    largest, nodes = size - scene.psfs.shape[-1] + 1, (draw.randint(1, 4), draw.randint(1, 4))
+    parts: list[Tensor] = []
+    for axis in (0, 1):
+        pixels, edges = scene.lower.shape[axis + 1], [0]
+        while edges[-1] < pixels:
+            edges.append(min(pixels, edges[-1] + draw.choice((largest, largest, draw.randint(1, largest)))))
+        middles = torch.tensor(edges[1:], dtype=torch.float64) - 2 * torch.rand(len(edges) - 1, dtype=torch.float64)
+        weights = torch.randn(len(edges) - 1, 2, nodes[axis], dtype=torch.float64)
+        weights[:, 1] *= draw.choice((0, 0.02, 0.02))
+        parts += [torch.tensor(edges), middles, weights]
+    psfs = torch.randn(*nodes, *scene.psfs.shape, dtype=scene.psfs.dtype)
+    places = Places(*parts)
+    about = f"{scene.about} nodes {nodes} tiles {len(parts[1])}x{len(parts[4])}"
+    products = math.prod(nodes) * scene.products
+    return replace(scene, psfs=psfs, about=about, products=products, places=places), size, correlate
+
+
+def _listed(scene: _Scene) -> list[Tensor]:
+    return [] if scene.places is None else list(scene.places)
+
+
+def _placed(scene: _Scene, light: Tensor, psfs: Tensor, weights: Tensor) -> Tensor:
+    """The definition of PSFs over the field: the pictures of the nodes, each with its weight at each pixel."""
+    if scene.places is None:
+        return _mixed(light, psfs, weights)
+    total: Any = 0
+    rows, columns = (
+        (own.repeat_interleave(edges.diff(), 0), torch.arange(int(edges[-1])) - middles.repeat_interleave(edges.diff()))
+        for edges, middles, own in (scene.places[:3], scene.places[3:])
+    )
+    for i, own in enumerate(psfs):
+        for j, psf in enumerate(own):
+            (a, y), (b, x) = (rows[0][..., i].T, rows[1]), (columns[0][..., j].T, columns[1])
+            share = (a[0] + y * a[1])[:, None] * b[0] + a[0][:, None] * (x * b[1])
+            total = total + share * _mixed(light, psf, weights)
+    return total
+
+
+def _overlap_error(scene: _Scene, light: Tensor, size: int) -> float:
+    """Bound what convolution by windows is off by; over the field also by light times its distance from a middle."""
+    if (places := scene.places) is None:
+        return _transform_error(light, scene.psfs, size)
+    rows, columns = (x.abs().amax(0) for x in (places.row_weights, places.column_weights))
+    value, y, x = (
+        torch.einsum("i,j,ijdcyx->dcyx", rows[m], columns[n], scene.psfs.double().abs()) for m, n in ((0, 0), (1, 0), (0, 1))
+    )
+    return 2 * _transform_error(light, value + 2 * size * (y + x), size)
+
+
 def _pixels(draw: random.Random, scene: _Scene) -> Tensor:
     pixels = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
     return pixels.mT.contiguous().mT if draw.random() < 0.3 else pixels
@@ -570,7 +666,7 @@ def _layers(
 
 def _weights(scene: _Scene, *, gradient: bool = False) -> Tensor:
     """(B, D, H, W) weights of each layer, or their derivatives with respect to the layer weight."""
-    layers = len(scene.psfs)
+    layers = scene.psfs.shape[-4]
     lower = one_hot(scene.lower, layers + 1).movedim(-1, 1).double()
     upper = one_hot(scene.lower + 1, layers + 1).movedim(-1, 1).double()
     if gradient:

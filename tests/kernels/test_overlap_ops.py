@@ -9,6 +9,7 @@ import torch
 
 from kornia_tidy.kernels.overlap_ops import (
     SOURCE,
+    Places,
     gather_overlap,
     overlap_psf_gradient,
     scatter_overlap,
@@ -27,6 +28,19 @@ def scene(**changes: Any) -> dict[str, Any]:
         "size": 16,
     }
     return {**arguments, **changes}
+
+
+def over_field(**changes: Any) -> dict[str, Any]:
+    """The same with 2x3 nodes over the field and two tiles side by side."""
+    places = Places(
+        torch.tensor([0, 4]),
+        torch.tensor([1.5], dtype=torch.float64),
+        torch.randn(1, 2, 2, dtype=torch.float64),
+        torch.tensor([0, 9, 17]),
+        torch.tensor([4.0, 12.5], dtype=torch.float64),
+        torch.randn(2, 2, 3, dtype=torch.float64),
+    )
+    return scene(psfs=torch.randn(2, 3, 3, 2, 3, 3, dtype=torch.float64), places=places, **changes)
 
 
 def pixels() -> torch.Tensor:
@@ -156,3 +170,66 @@ class TestOverlapPsfGradient(SceneOperatorTester):
         given = scene(layer_index=torch.ones(2, 4, 17, dtype=torch.int64))
         got = overlap_psf_gradient(given["plane"], pixels(), given["layer_index"], None, 3, 16)
         assert [bool(layer.any()) for layer in got] == [False, True, False]
+
+
+class TestGatherOverField(SceneOperatorTester):
+    source = SOURCE
+    draw = staticmethod(kernel_shapes.field_gather)
+
+    def smallest(self):
+        return gather_overlap(**over_field())
+
+    @needs_compiler
+    def test_feature_threads_change_no_bit(self):
+        before, got = torch.get_num_threads(), []
+        given = over_field(plane=torch.randn(2, 2, 6, 19, dtype=torch.float64))
+        spread = {**given, "pixels": pixels()}
+        del spread["plane"]
+        try:
+            for threads in (1, 2, 3):
+                torch.set_num_threads(threads)
+                got.append((gather_overlap(**given), scatter_overlap(**spread)))
+        finally:
+            torch.set_num_threads(before)
+        for gathered, scattered in got[1:]:
+            assert torch.equal(gathered, got[0][0])
+            assert torch.equal(scattered, got[0][1])
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ({"row_edges": [0, 5]}, "edges of tiles must ascend from 0 to 4 by 14 at most, got .0, 5."),
+            ({"row_edges": [1, 4]}, "edges of tiles must ascend from 0 to 4 by 14 at most"),
+            ({"column_edges": [0, 17, 17]}, "edges of tiles must ascend from 0 to 17 by 14 at most"),
+            ({"column_edges": [0, 17]}, r"places must be n \+ 1 edges, n middles and \(n, 2, 3\) weights of nodes, got"),
+        ],
+    )
+    def test_exception_places(self, changes, words):
+        given = over_field()
+        changed = {name: torch.tensor(edges) for name, edges in changes.items()}
+        with pytest.raises(ValueError, match=words):
+            gather_overlap(**{**given, "places": given["places"]._replace(**changed)})
+
+    def test_exception_psfs_of_the_axis_with_places(self):
+        with pytest.raises(ValueError, match=r"psfs over the field must have shape \(I, J, D, C, P, P\), got \(3, 2, 3, 3"):
+            gather_overlap(**{**over_field(), "psfs": scene()["psfs"]})
+
+
+class TestScatterOverField(SceneOperatorTester):
+    source = SOURCE
+    draw = staticmethod(kernel_shapes.field_scatter)
+
+    def smallest(self):
+        given = over_field()
+        del given["plane"]
+        return scatter_overlap(pixels(), **given)
+
+
+class TestPsfGradientOverField(SceneOperatorTester):
+    source = SOURCE
+    draw = staticmethod(kernel_shapes.field_correlate)
+
+    def smallest(self):
+        given = over_field()
+        labels = given["layer_index"], given["layer_weight"]
+        return overlap_psf_gradient(given["plane"], pixels(), *labels, 3, 16, places=given["places"])
