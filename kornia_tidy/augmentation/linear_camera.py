@@ -126,7 +126,7 @@ class LinearCamera(nn.Module):
         bank: PSFBank = now.psf_model.scene_bank(channels, dtype, defocus)
         fidelity = now.psf_model.fidelity
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        options = [now.compositing, layers, now.border, fidelity.correlate, "auto"]
+        options = [now.compositing, layers, now.border, fidelity.correlate, [], "auto"]
         return [defocus, bank.defocus, bank.psfs, bank.veil], options
 
 

@@ -66,6 +66,24 @@ class Places(NamedTuple):
     column_middles: Tensor
     column_weights: Tensor
 
+    def of_pixels(self) -> Tensor:
+        """Return the weight of each node at each pixel, (I J, H, W) float64.
+
+        Example:
+            >>> one = torch.tensor([0, 1]), torch.zeros(1), torch.tensor([[[1.0], [0.0]]])
+            >>> two = torch.tensor([0, 3]), torch.ones(1), torch.tensor([[[0.5, 0.5], [-0.25, 0.25]]])
+            >>> Places(*one, *two).of_pixels().flatten(1)
+            tensor([[0.7500, 0.5000, 0.2500],
+                    [0.2500, 0.5000, 0.7500]])
+        """
+        values, slopes = [], []
+        for edges, middles, weights in (self[:3], self[3:]):
+            own, pixels = weights.repeat_interleave(edges.diff(), 0), torch.arange(int(edges[-1]))
+            values.append(own[:, 0].T)
+            slopes.append((own[:, 1] * (pixels - middles.repeat_interleave(edges.diff()))[:, None]).T)
+        (a, b), (y, x) = values, slopes
+        return ((a + y)[:, None, :, None] * b[:, None] + a[:, None, :, None] * x[:, None]).flatten(0, 1)
+
 
 def gather_overlap(
     plane: Tensor,
@@ -163,8 +181,8 @@ def overlap_psf_gradient(
         places: as there.
 
     Returns:
-        (D, C, P, P), or with ``places`` (I, J, D, C, P, P), added in the same order every time with as many threads. It has no gradient. Errors are those of
-        :func:`gather_overlap`.
+        (D, C, P, P), or with ``places`` (I, J, D, C, P, P), added in the same order every time with as many threads. It
+        has no gradient. Errors are those of :func:`gather_overlap`.
     """
     labels = layer_index, layer_weight
     return torch.ops.kornia_tidy.overlap_psf_gradient(plane, pixels, *labels, layers, size, correlate, list(places))
@@ -242,13 +260,13 @@ def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
 def _check_places(places: list[Tensor], nodes: tuple[int, ...]) -> None:
     """Refuse places whose tensors do not fit one another or the nodes. Looks at no value."""
     given = Places(*places)
-    for axis, count in zip((given[:3], given[3:]), nodes, strict=True):
+    for axis, many in zip((given[:3], given[3:]), nodes, strict=True):
         edges, middles, weights = axis
         tiles = tuple(middles.shape)
-        if (tuple(edges.shape), tuple(weights.shape)) != ((len(middles) + 1,), (*tiles, 2, count)):
+        if (tuple(edges.shape), tuple(weights.shape)) != ((len(middles) + 1,), (*tiles, 2, many)):
             shapes = ", ".join(str(tuple(x.shape)) for x in axis)
             raise ValueError(
-                f"places must be n + 1 edges, n middles and (n, 2, {count}) weights of nodes, got shapes {shapes}"
+                f"places must be n + 1 edges, n middles and (n, 2, {many}) weights of nodes, got shapes {shapes}"
             )
 
 

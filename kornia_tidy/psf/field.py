@@ -33,8 +33,8 @@ class Field:
         cell: side in pixels of the cells in which PSFs are taken to first order about the middle.
 
     Convention:
-        - The middle of the picture is at ``(size - 1) / 2``. Pixels beyond the picture, as of a border, see the PSF of
-          the nearest pixel in it.
+        - The middle of the picture is at ``(size - 1) / 2``. PSFs beyond the picture, as of a border, are those of the
+          nearest pixel in it; in a cell whose middle lies in the picture they are continued to first order.
 
     Example:
         >>> field = Field((101, 201), (2, 3))
@@ -77,6 +77,33 @@ class Field:
         places = (pixels.double() - half) / max(half, 0.5)
         weights, slopes = lagrange(self.nodes[axis], places.clamp(-1, 1))
         return weights, slopes / max(half, 0.5) * (places.abs() <= 1)[:, None]
+
+    def tiles(self, axis: int, first: int, pixels: int, most: int, beyond: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the tiles along an axis of a part of the picture: as large as possible, and alike in any part.
+
+        Args:
+            axis: 0 for rows, 1 for columns.
+            first: row or column of the picture at which the part begins.
+            pixels: of the part.
+            most: pixels of a tile.
+            beyond: pixels of a border on either side of the picture, which tiles cover too.
+
+        Returns:
+            Where in the part tiles begin, and its end, (n + 1,) int64; the middles of the picture's tiles, counted from
+            the part's first pixel, (n,) float64; the nodes' weights there, and their slopes, (n, 2, nodes).
+
+        Example:
+            >>> edges, middles, weights = Field((1, 90), (1, 2)).tiles(1, 20, 60, 40)
+            >>> edges.tolist(), middles.tolist(), weights[:, 0, 1].round(decimals=2).tolist()
+            ([0, 10, 40, 60], [-5.5, 24.5, 54.5], [0.16, 0.5, 0.84])
+        """
+        whole = self.size[axis] + 2 * beyond
+        side = -(-whole // -(-whole // most))
+        begin, end = ((at + beyond) // side for at in (first, first + pixels - 1))
+        starts = torch.arange(begin, end + 1) * side - beyond
+        middles = starts.double() + (side - 1) / 2
+        edges = torch.cat([(starts - first).clamp(min=0), torch.tensor([pixels])])
+        return edges, middles - first, torch.stack(self.along(axis, middles), 1)
 
 
 def check_center(center: Any) -> tuple[float, float]:

@@ -15,11 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kornia_tidy.kernels.build import compiled
+from kornia_tidy.kernels.overlap_ops import SOURCE
 from kornia_tidy.mode import torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
@@ -57,6 +60,10 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     """
     radius, border = bank.window // 2, rendering.border
     check_border(border, *light.shape[-2:], bank.window)
+    if _is_compiled(light, bank, rendering):
+        given = light, defocus, bank.defocus, bank.psfs, None
+        seen = render_layers(*given, **asdict(rendering), field=field)
+        return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
     plane, deep, inside, around = light, defocus, None, field
     if border != "valid":
         plane = pad_border(light, radius, border)
@@ -73,6 +80,14 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     cells = _Cells(bank, around, rendering)
     seen = cells.scatter(plane, deep) if rendering.compositing == "scatter" else cells.see(plane, deep, inside)
     return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
+
+
+def _is_compiled(light: Tensor, bank: FieldBank, rendering: Rendering) -> bool:
+    """Return whether the compiled backend takes PSFs over the field: for occlusion and elsewhere cells are rendered."""
+    dtype = torch.promote_types(torch.promote_types(light.dtype, bank.psfs.dtype), torch.float32)
+    if rendering.compositing == "occlusion" or rendering.method not in ("auto", "compiled") or torch_mode():
+        return False
+    return light.device.type == "cpu" and compiled(SOURCE, dtype) is not None
 
 
 def _veil(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> Tensor:
@@ -93,12 +108,12 @@ class _Steps:
 
     Args:
         pixels: of the plane.
-        middle: of the cell in the picture, (1,).
+        weights: of the nodes at the middle of the cell, and their slopes, (2, nodes).
         offset: of the pixels from the middle.
     """
 
     pixels: slice
-    middle: Tensor
+    weights: Tensor
     offset: Tensor
 
 
@@ -115,7 +130,7 @@ class _Cells:
         """Return the cells along a row, and how value and slopes there follow from those at its nodes, (3, 2 nx)."""
         found = []
         for across in self._steps(1, deep, margin):
-            weights, slopes = self.field.along(1, across.middle)
+            weights, slopes = across.weights.split(1)
             none = torch.zeros_like(weights)
             mixing = torch.cat([torch.cat([weights, none, slopes]), torch.cat([none, weights, none])], 1)
             found.append((across, mixing.to(self.psfs)))
@@ -196,7 +211,7 @@ class _Cells:
     def _lines(self, deep: Tensor, margin: int) -> Iterator[tuple[_Steps, tuple[int, Tensor]]]:
         """Yield rows of cells with their PSFs at the nodes along the rows, values and slopes, (D, 2 nx, C P P)."""
         for down in self._steps(0, deep, margin):
-            weights = torch.cat(self.field.along(0, down.middle)).to(self.psfs)
+            weights = down.weights.to(self.psfs)
             whole = self.psfs.view(len(self.psfs), self.field.nodes[0], -1)
             own = self._layers(deep[..., _wider(down.pixels, margin), :])
             rows = (weights @ whole[own]).view(own.stop - own.start, 2 * self.field.nodes[1], -1)
@@ -210,19 +225,17 @@ class _Cells:
 
     def _light(self, down: _Steps, mixing: Tensor, own: slice) -> Tensor:
         """Return value and slopes of the relative illumination of a cell, (D, 3, C)."""
-        weights = torch.cat(self.field.along(0, down.middle)).to(self.light)
+        weights = down.weights.to(self.light)
         rows = weights @ self.light[own].unflatten(1, self.field.nodes).flatten(2)
         return mixing @ rows.unflatten(2, (self.field.nodes[1], -1)).flatten(1, 2)
 
     def _steps(self, axis: int, deep: Tensor, margin: int) -> Iterator[_Steps]:
         """Yield the cells along an axis. They stand at the same places of the picture whatever part of it is seen."""
-        size, side, first = self.field.size[axis], self.field.cell, 0
-        places = torch.arange(deep.shape[axis - 2] - 2 * margin) + self.field.origin[axis] + margin
-        places = places.clamp(0, size - 1).double()
-        for cell, count in zip(*torch.unique_consecutive(places // side, return_counts=True), strict=True):
-            pixels = slice(first, first := first + int(count))
-            middle = (cell * side + (cell * side + side).clamp(max=size) - 1) / 2
-            yield _Steps(pixels, middle[None], (places[pixels] - middle).to(self.psfs))
+        first, pixels = self.field.origin[axis] + margin, deep.shape[axis - 2] - 2 * margin
+        beyond = self.radius if self.rendering.compositing == "scatter" else 0
+        edges, middles, weights = self.field.tiles(axis, first, pixels, self.field.cell, beyond)
+        for own, middle, there in zip(pairwise(edges.tolist()), middles.tolist(), weights, strict=True):
+            yield _Steps(slice(*own), there, (torch.arange(*own) - middle).to(self.psfs))
 
     def _layers(self, depths: Tensor) -> slice:
         """Return the layers that pixels need; all where one would have to wait for their values."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.mode import Mode, recording_in_operator, torch_mode
+from kornia_tidy.psf.field import Field
 from kornia_tidy.render.backends.dense import differentiable_gradients
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.layers import check_nodes
@@ -24,7 +25,7 @@ from kornia_tidy.render.stray_light import stray_light_of
 
 _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
-    " str border, bool correlate, str method"
+    " str border, bool correlate, int[] field, str method"
 )
 COMPOSITINGS = ("gather", "scatter", "occlusion")
 _TENSORS = 5  # of a scene, which may have gradients
@@ -64,6 +65,7 @@ def render_layers(
     border: str,
     correlate: bool,
     method: str,
+    field: Field | None = None,
 ) -> Tensor:
     """Render a scene by the backend that suits it, or by one that is named: operator ``kornia_tidy::render_layers``.
 
@@ -79,6 +81,7 @@ def render_layers(
         border: as there.
         correlate: as there.
         method: ``"auto"`` or the name of a backend, see :func:`kornia_tidy.render.dispatch.choose`.
+        field: where over the picture PSFs (F, D, C, P, P) are known; default: they are the same everywhere.
 
     Returns:
         (B, C, h, w) in the image's dtype, computed in float32 or better, autocast or not. It has gradients with respect
@@ -90,12 +93,25 @@ def render_layers(
     """
     if compositing not in COMPOSITINGS:
         check_choice("compositing", compositing, COMPOSITINGS)
-    check_scene(image, defocus, nodes, psfs, stray_light, border)
+    check_scene(image, defocus, nodes, psfs if field is None else psfs[0], stray_light, border)
     mode = torch_mode()
     if nodes.device.type != "cpu" and Mode.UNREAD not in mode:
         check_nodes(nodes)
     render = _rendered if Mode.TRANSFORM in mode else torch.ops.kornia_tidy.render_layers
-    return render(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, method)
+    tensors, over = (image, defocus, nodes, psfs, stray_light), numbers_of(field)
+    return render(*tensors, compositing, layers, border, correlate, over, method)
+
+
+def numbers_of(field: Field | None) -> list[int]:
+    """Return a field as the renderer's operators take it."""
+    return [] if field is None else [*field.size, *field.nodes, *field.origin, field.cell]
+
+
+def _field(numbers: Sequence[int]) -> Field | None:
+    if not numbers:
+        return None
+    rows, columns, down, across, top, left, cell = numbers
+    return Field((rows, columns), (down, across), origin=(top, left), cell=cell)
 
 
 def _rendered(*arguments: Any) -> Tensor:
@@ -103,7 +119,7 @@ def _rendered(*arguments: Any) -> Tensor:
     if not len(image):
         return _render_fake(*arguments)
     with torch.autocast(image.device.type, enabled=False):
-        scene = assigned_scene(*arguments[:-1])
+        scene = assigned_scene(*arguments[:-2], _field(arguments[-2]))
         light = choose(scene, method).render(scene)
         if scene.stray_light is not None and scene.compositing != "occlusion":
             light = light + stray_light_of(scene)
@@ -124,7 +140,7 @@ def _gradients(*arguments: Any) -> list[Tensor]:
     own: list[Any] = [None if x is None else x.detach().requires_grad_(want) for x, want in given]
     leaves = [x for x in own if x is not None and x.requires_grad]
     with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        scene = assigned_scene(*own, *options)
+        scene = assigned_scene(*own, *options[:-1], _field(options[-1]))
         pairs = choose(scene, method).gradients(scene, gradient.to(scene.image.dtype))
         if scene.stray_light is not None and scene.compositing != "occlusion":
             stray_light = stray_light_of(scene)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.kernels.overlap_ops import Places, window_size
+from kornia_tidy.psf.field import Field
 from kornia_tidy.render.borders import BORDERS, check_border, pad_border, padded_size
 from kornia_tidy.render.layers import assign_layers, check_nodes
 
@@ -64,13 +67,14 @@ class LayeredScene:
         image: (B, C, H, W) linear light in float32 or float64.
         layer_index: (B or 1, 1, H, W) int64 index of each pixel's layer.
         layer_weight: (B or 1, 1, H, W) weight of the next layer, or None for nearest layers.
-        psfs: (D, C, P, P) of the image's dtype, with P odd.
+        psfs: (D, C, P, P) of the image's dtype, with P odd; with a field (F, D, C, P, P).
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         dtype: of the rendered image.
         sorted_layers: layer index and layer weight of the pixels that are sorted, and
         labels: the same for each image of the batch, without gradients.
+        field: where over the picture PSFs are known, or None for PSFs that are the same everywhere.
         found: planes that were made of the scene, by their names, so that they are made once.
     """
 
@@ -84,7 +88,8 @@ class LayeredScene:
     dtype: torch.dtype
     sorted_layers: tuple[Tensor, Tensor | None]
     labels: Labels
-    found: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    field: Field | None = None
+    found: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -109,6 +114,23 @@ class LayeredScene:
         """Layer weight of :attr:`sorted_layers` for each image of the batch, with gradients."""
         weight = self.sorted_layers[1]
         return None if weight is None else weight.expand(len(self.image), -1, -1)
+
+    @property
+    def places(self) -> Places:
+        """Tiles over the field and the nodes' weights there: at the pixels that see, for scatter at those of the light.
+
+        Tiles are as large as suits the PSFs, but not larger than the field's cells.
+        """
+        if "places" not in self.found:
+            assert self.field is not None
+            side, origin = self.psfs.shape[-1], self.field.origin
+            scatters, valid = self.compositing == "scatter", self.border == "valid"
+            sides, beyond = (self.padded_size, side // 2) if scatters else (self.output_size, 0)
+            moved = side // 2 * (valid - scatters)
+            most = min(self.field.cell, window_size(side) - side + 1)
+            rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most, beyond) for i in (0, 1))
+            self.found["places"] = Places(*rows, *columns)
+        return self.found["places"]
 
     @property
     def sampled_layers(self) -> int:
@@ -174,6 +196,7 @@ def assigned_scene(
     layers: str,
     border: str,
     correlate: bool,
+    field: Field | None = None,
 ) -> LayeredScene:
     """Return the scene of :func:`layered_scene`, whose tensors were checked before."""
     dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
@@ -187,6 +210,7 @@ def assigned_scene(
         border,
         compositing,
         image.dtype,
+        field,
     )
 
 
@@ -199,6 +223,7 @@ def scene_of_layers(
     border: str,
     compositing: str,
     dtype: torch.dtype,
+    field: Field | None = None,
 ) -> LayeredScene:
     """Return a scene with layers that the caller knows already. Nothing is checked.
 
@@ -211,6 +236,7 @@ def scene_of_layers(
         border: what lies beyond the image.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         dtype: of the rendered image.
+        field: where over the picture PSFs are known.
     """
     index, weight, radius, batch = layer_index, layer_weight, psfs.shape[-1] // 2, len(image)
     if compositing != "gather":
@@ -224,8 +250,9 @@ def scene_of_layers(
     with_gradient = weight is not None and weight.requires_grad and torch.is_grad_enabled()
     of_batch = None if weight is None else weight.detach().expand(batch, -1, -1)
     labels = Labels(index.expand(batch, -1, -1), of_batch, with_gradient)
+    sorted_layers = index, weight
     return LayeredScene(
-        image, layer_index, layer_weight, psfs, stray_light, border, compositing, dtype, (index, weight), labels
+        image, layer_index, layer_weight, psfs, stray_light, border, compositing, dtype, sorted_layers, labels, field
     )
 
 

@@ -170,9 +170,13 @@ def _overlap_scatter(draw: random.Random, drawn: tuple[_Scene, int, bool]) -> Ca
         expected = torch.autograd.grad((coded * pixels.double()).sum(), light)[0]
         layers, side = scene.psfs.shape[-4], scene.psfs.shape[-1]
         # Windows of four tiles overlap, and of more where tiles over the field are narrow.
-        together = 4 if scene.places is None else math.prod(
-            max(2, int(((x[None] < x[:-1, None] + side - 1) & (x[None] >= x[:-1, None])).sum(1).max()) + 1)
-            for x in (scene.places.row_edges, scene.places.column_edges)
+        together = (
+            4
+            if scene.places is None
+            else math.prod(
+                max(2, int(((x[None] < x[:-1, None] + side - 1) & (x[None] >= x[:-1, None])).sum(1).max()) + 1)
+                for x in (scene.places.row_edges, scene.places.column_edges)
+            )
         )
         return expected, together * layers * _overlap_error(scene, pixels, size)
 
@@ -573,7 +577,7 @@ def _overlapping(draw: random.Random) -> tuple[_Scene, int, bool]:
 
 
 def _over_field(draw: random.Random) -> tuple[_Scene, int, bool]:
-    """A scene with PSFs at nodes over the field, tiles of any sizes, the side of windows, and whether PSFs are flipped."""
+    """A scene with PSFs at nodes over the field and tiles of any sizes; otherwise as above."""
     scene, size, correlate = _overlapping(draw)
     largest, nodes = size - scene.psfs.shape[-1] + 1, (draw.randint(1, 4), draw.randint(1, 4))
     parts: list[Tensor] = []
@@ -619,7 +623,8 @@ def _overlap_error(scene: _Scene, light: Tensor, size: int) -> float:
         return _transform_error(light, scene.psfs, size)
     rows, columns = (x.abs().amax(0) for x in (places.row_weights, places.column_weights))
     value, y, x = (
-        torch.einsum("i,j,ijdcyx->dcyx", rows[m], columns[n], scene.psfs.double().abs()) for m, n in ((0, 0), (1, 0), (0, 1))
+        torch.einsum("i,j,ijdcyx->dcyx", rows[m], columns[n], scene.psfs.double().abs())
+        for m, n in ((0, 0), (1, 0), (0, 1))
     )
     return 2 * _transform_error(light, value + 2 * size * (y + x), size)
 

@@ -201,7 +201,10 @@ class TestGatherOverField(SceneOperatorTester):
             ({"row_edges": [0, 5]}, "edges of tiles must ascend from 0 to 4 by 14 at most, got .0, 5."),
             ({"row_edges": [1, 4]}, "edges of tiles must ascend from 0 to 4 by 14 at most"),
             ({"column_edges": [0, 17, 17]}, "edges of tiles must ascend from 0 to 17 by 14 at most"),
-            ({"column_edges": [0, 17]}, r"places must be n \+ 1 edges, n middles and \(n, 2, 3\) weights of nodes, got"),
+            (
+                {"column_edges": [0, 17]},
+                r"places must be n \+ 1 edges, n middles and \(n, 2, 3\) weights of nod",
+            ),
         ],
     )
     def test_exception_places(self, changes, words):
@@ -211,7 +214,7 @@ class TestGatherOverField(SceneOperatorTester):
             gather_overlap(**{**given, "places": given["places"]._replace(**changed)})
 
     def test_exception_psfs_of_the_axis_with_places(self):
-        with pytest.raises(ValueError, match=r"psfs over the field must have shape \(I, J, D, C, P, P\), got \(3, 2, 3, 3"):
+        with pytest.raises(ValueError, match=r"psfs over the field must have shape \(I, J, D, C, P, P\), got \(3, 2"):
             gather_overlap(**{**over_field(), "psfs": scene()["psfs"]})
 
 

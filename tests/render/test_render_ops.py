@@ -19,7 +19,7 @@ def arguments(compositing="gather", *, layers="linear", border="reflect", method
     bank = make_bank(4, 2, 5, dtype=dtype, light=0.8, veil=True)
     image, defocus = make_scene(bank, 2, 9, 40)
     tensors = [x.requires_grad_() for x in (image, defocus, bank.defocus, bank.psfs, bank.veil)]
-    return *tensors, compositing, layers, border, False, method
+    return *tensors, compositing, layers, border, False, [], method
 
 
 class Renderer(torch.nn.Module):

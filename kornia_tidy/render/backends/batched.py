@@ -49,8 +49,9 @@ class BatchedBackend:
 
     name = "batched"
 
-    def refusal(self, scene: LayeredScene) -> None:
-        """Return None: it supports every scene."""
+    def refusal(self, scene: LayeredScene) -> str | None:
+        """Return None: it supports every scene through PSFs that are the same everywhere."""
+        return None if scene.field is None else "PSFs that vary over the picture are rendered cell by cell"
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64 where the device has it."""

@@ -20,6 +20,7 @@ from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.batched import BatchedBackend
+from kornia_tidy.render.backends.dense import OCCLUSION_OVER_FIELD
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
 from kornia_tidy.render.backends.tiles import Grid
@@ -53,6 +54,8 @@ class CompiledBackend:
             return "it needs a C compiler (see `kornia-tidy info`)"
         if not occludes:
             return None
+        if scene.field is not None:
+            return OCCLUSION_OVER_FIELD
         if not _fits(scene, smallest := occlusion_ops.smallest_output(image.dtype)):
             least, size = ("x".join(map(str, sides)) for sides in (smallest, scene.output_size))
             return f"its occlusion needs an output of at least {least} pixels, got {size}"
@@ -109,22 +112,25 @@ class _Sums:
 
     def __init__(self, scene: LayeredScene) -> None:
         self.psfs, self.labels = scene.psfs.detach(), (scene.labels.layer_index, scene.labels.layer_weight)
-        self.size, self.directly = window_size(scene.psfs.shape[-1]), _goes_directly(scene)
+        self.size, self.directly, self.places = window_size(scene.psfs.shape[-1]), _goes_directly(scene), ()
+        if scene.field is not None:
+            self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         if self.directly:
             return gather_direct(plane, self.psfs, *self.labels, weight_gradient=weight_gradient)
-        options = {"correlate": correlate, "weight_gradient": weight_gradient}
+        options = {"correlate": correlate, "weight_gradient": weight_gradient, "places": self.places}
         return gather_overlap(plane, self.psfs, *self.labels, self.size, **options)
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        return scatter_overlap(pixels, self.psfs, *self.labels, self.size, correlate=correlate)
+        return scatter_overlap(pixels, self.psfs, *self.labels, self.size, correlate=correlate, places=self.places)
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        given = plane, pixels, *self.labels, len(self.psfs)
+        given = plane, pixels, *self.labels, self.psfs.shape[-4]
         if self.directly:
             return gather_direct_psf_gradient(*given)
-        return overlap_psf_gradient(*given, self.size, correlate=correlate)
+        found = overlap_psf_gradient(*given, self.size, correlate=correlate, places=self.places)
+        return found.flatten(0, 1) if self.places else found
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
@@ -139,7 +145,7 @@ def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs
 
 
 def _goes_directly(scene: LayeredScene) -> bool:
-    small = scene.compositing == "gather" and scene.psfs.shape[-1] <= LARGEST_DIRECT
+    small = scene.compositing == "gather" and scene.psfs.shape[-1] <= LARGEST_DIRECT and scene.field is None
     return small and _fits(scene, gather_ops.smallest_output(scene.image.dtype))
 
 

@@ -17,6 +17,7 @@ from kornia_tidy.render.borders import from_spectrum, to_spectrum
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
+OCCLUSION_OVER_FIELD = "occlusion through PSFs that vary over the picture is rendered cell by cell"
 _PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
 
 
@@ -25,8 +26,9 @@ class DenseBackend:
 
     name = "dense"
 
-    def refusal(self, scene: LayeredScene) -> None:
-        """Return None: it supports every scene."""
+    def refusal(self, scene: LayeredScene) -> str | None:
+        """Return None: it supports every scene, but for occlusion over a field."""
+        return OCCLUSION_OVER_FIELD if scene.field is not None and scene.compositing == "occlusion" else None
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work for the layers in every eighth row and column of the scene."""
@@ -36,9 +38,18 @@ class DenseBackend:
         """Return the rendered light, for occlusion in float64."""
         if scene.compositing == "occlusion":
             return occlude_dense(*occlusion_planes(scene))
-        composite = gather_dense if scene.compositing == "gather" else scatter_dense
         index, weight = scene.sorted_layers
-        return composite(scene.plane, scene.psfs, weight, index)
+        gathers = scene.compositing == "gather"
+        composite = gather_dense if gathers else scatter_dense
+        if scene.field is None:
+            return composite(scene.plane, scene.psfs, weight, index)
+        total = torch.zeros((), dtype=scene.plane.dtype, device=scene.plane.device)
+        for share, psfs in zip(scene.places.of_pixels().to(scene.plane), scene.psfs, strict=True):  # of each node
+            if gathers:
+                total = total + share * composite(scene.plane, psfs, weight, index)
+            else:
+                total = total + composite(share * scene.plane, psfs, weight, index)
+        return total
 
     @torch.enable_grad()
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
