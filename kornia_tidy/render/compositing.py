@@ -7,7 +7,7 @@ Each function makes a layered scene of its arguments (:mod:`kornia_tidy.render.s
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -78,7 +78,7 @@ def render(
         >>> render(torch.rand(4, 3, 32, 48), torch.zeros(1, 1, 32, 48), bank, border="valid").shape
         torch.Size([4, 3, 28, 44])
     """
-    options = {"compositing": compositing, "layers": layers, "border": border}
+    options: dict[str, Any] = {"compositing": compositing, "layers": layers, "border": border}
     scene = image, defocus, bank.defocus, bank.psfs, bank.veil
     return render_layers(*scene, correlate=correlate, method=method, **options)
 
@@ -128,7 +128,7 @@ def gather(
         >>> (coded[0, 0, 2] * 100).round().int().tolist()
         [0, 0, 25, 75, 0]
     """
-    options = {"compositing": "gather", "layers": layers, "border": border}
+    options: dict[str, Any] = {"compositing": "gather", "layers": layers, "border": border}
     return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
@@ -168,7 +168,7 @@ def scatter(
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
-    options = {"compositing": "scatter", "layers": layers, "border": border}
+    options: dict[str, Any] = {"compositing": "scatter", "layers": layers, "border": border}
     return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
@@ -227,7 +227,7 @@ def occlusion(
         >>> (coded[0, 0, 0] * 100).round().int().tolist()
         [0, 33, 67, 100]
     """
-    options = {"compositing": "occlusion", "layers": layers, "border": border}
+    options: dict[str, Any] = {"compositing": "occlusion", "layers": layers, "border": border}
     return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
 
 
