@@ -19,7 +19,7 @@ help:
 	@echo "              ARGS='--list' shows them, ARGS='--only aten' runs some, ARGS=--quick a share of each"
 	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
 	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"
-	@echo "make extremes   how exact captures are at the extremes, as docs/extremes.md: minutes; ARGS=--quick a part of it"
+	@echo "make extremes   how exact captures are at the extremes, as docs/record/extremes.md: minutes; ARGS=--quick a part of it"
 	@echo "make fuzz     damaged files through every reading function: 2000, or ARGS='--count 100000 --seed 1 --guided'"
 	@echo "make lint     style, spelling and types"
 	@echo "make docs     the site of the documentation, in outputs/site: minutes at first, for the examples of its gallery;"

@@ -20,8 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from kornia_tidy.cli import main as kornia_tidy
-from kornia_tidy.data import dead_leaves, write_depth, write_image
+from kornia_tidy.cli.command_line import main as kornia_tidy
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -48,12 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> list[Path]:
 
 
 def run(page: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Run the blocks of a page beside photo.png and depth.png, and return its pictures as arrays (H, W, 3)."""
+    """Run the blocks of a page in an empty folder, and return its pictures as arrays (H, W, 3)."""
     names: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        image, depth = dead_leaves(256, 360, depth_range=(0.35, 3.0), num_leaves=160, seed=3)
-        write_image("photo.png", image)
-        write_depth("depth.png", depth, scale=0.001)
         torch.manual_seed(0)
         for language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
             if language == "python":

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/guides/: the code of each page is run on a painted scene, and its last picture is kept.
+"""Draw the pictures of docs/guides/: the code of each page is run, and its last picture is kept.
 
     python docs/make_guide_pictures.py         # all pages
     python docs/make_guide_pictures.py slm     # one of them
@@ -21,8 +21,7 @@ from typing import Any
 import cv2
 import torch
 
-from kornia_tidy.cli import main as kornia_tidy
-from kornia_tidy.data import dead_leaves, write_depth, write_image
+from kornia_tidy.cli.command_line import main as kornia_tidy
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"(<!-- slow: [^>]*-->\n)?^```(python|bash)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -40,12 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> list[Path]:
 
 
 def draw(page: Path, path: Path) -> Path:
-    """Run a page beside photo.png and depth.png until it has written guide.png, and keep that as a JPEG."""
+    """Run a page in an empty folder until it has written guide.png, and keep that as a JPEG."""
     names: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        image, depth = dead_leaves(192, 256, depth_range=(0.35, 3.0), num_leaves=120, seed=3)
-        write_image("photo.png", image)
-        write_depth("depth.png", depth, scale=0.001)
         torch.manual_seed(0)
         for slow, language, text in BLOCK.findall(page.read_text(encoding="utf-8")):
             if language == "python":

@@ -19,6 +19,7 @@ from tests.base import BaseTester
 ROOT = Path(__file__).resolve().parents[1]
 HOSTS = {
     "arxiv.org": r"/abs/\d{4}\.\d{5}",
+    "download.pytorch.org": r"/whl/cpu",
     "horatio.cs.nyu.edu": r"/mit/silberman/.+\.mat",
     "keepachangelog.com": r"/en/\d\.\d\.\d/",
     "lmb.informatik.uni-freiburg.de": r"/resources/datasets/\w+\.en\.html",

@@ -1,8 +1,8 @@
 """Every block of code in the README, in docs/ and in CONTRIBUTING.md is run.
 
-The blocks of a page are run in their order, in a folder of their own that holds photo.png and depth.png. Python blocks
-share one namespace. Shell lines are commands of `kornia-tidy`, given to its entry point, or of a checkout. A ```text
-block tells what the block before it prints; ... in it stands for anything. Options of <!-- run with: OPTIONS --> are
+The blocks of a page are run in their order, in an empty folder. Python blocks share one namespace. Shell lines are
+commands of `kornia-tidy`, given to its entry point, or of a checkout. A ```text block tells what the block before it
+prints; ... in it stands for anything. Options of <!-- run with: OPTIONS --> are
 appended to the commands of the block, to make them shorter. A block after <!-- slow: reason --> is run with --runslow;
 without, its names are imported and its commands read their arguments. So do commands of make and of Python's modules
 that stand in a sentence or a table.
@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from kornia_tidy.cli import main
+from kornia_tidy.cli.command_line import main
 from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
@@ -41,6 +41,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "ecosystems").glob("*.md")),
     *sorted((ROOT / "docs" / "guides").glob("*.md")),
+    *sorted((ROOT / "docs" / "record").glob("*.md")),
 ]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 PUBLISHED_NETWORKS = {
@@ -173,10 +174,7 @@ def anchors(page: Path) -> set[str]:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with a scene in two files, which commands and scripts are run in."""
-    image, depth = dead_leaves(96, 128, depth_range=(0.4, 3.0), num_leaves=60)
-    write_image(tmp_path / "photo.png", image)
-    write_depth(tmp_path / "depth.png", depth, scale=0.001)
+    """An empty folder, which commands and scripts are run in: what a page reads, it has written."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", ["kornia-tidy"])
     torch.manual_seed(0)
@@ -250,8 +248,16 @@ class TestEveryPage(BaseTester):
         assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 200
 
     def test_feature_the_readme_links_every_page(self):
+        """By way of the list of all pages; the guides and the libraries have lists of theirs."""
         links = {file for file, _ in LINK.findall((ROOT / "README.md").read_text(encoding="utf-8"))}
-        assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} <= links
+        assert "docs/README.md" in links
+        listed = {file for file, _ in LINK.findall((ROOT / "docs" / "README.md").read_text(encoding="utf-8"))}
+        docs = ROOT / "docs"
+        pages = {path.relative_to(docs).as_posix() for path in [*docs.glob("*.md"), *docs.glob("record/*.md")]}
+        assert pages - {"README.md"} <= listed
+        for name in ("guides", "ecosystems"):
+            listed = {file for file, _ in LINK.findall((docs / f"{name}.md").read_text(encoding="utf-8"))}
+            assert {path.relative_to(docs).as_posix() for path in docs.glob(f"{name}/*.md")} <= listed
 
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_the_site_lists_every_page_once(self, name):
@@ -312,6 +318,9 @@ class TestRunPage(BaseTester):
             run_page("p.md", text, slow=True)
 
     def test_feature_options_are_appended_to_the_commands(self, folder):
+        image, depth = dead_leaves(96, 128, depth_range=(0.4, 3.0), num_leaves=60)
+        write_image(folder / "photo.png", image)
+        write_depth(folder / "depth.png", depth, scale=0.001)
         lines = ("```bash", "kornia-tidy simulate photo.png --depth depth.png --depth-scale 0.001 -o a.png", "```")
         run_page("p.md", page("<!-- slow: a second -->", "<!-- run with: -o b.png -->", *lines), slow=True)
         assert [path.name for path in folder.glob("?.png")] == ["b.png"]

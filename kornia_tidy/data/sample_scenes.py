@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.data.dead_leaves import check_arguments
 from kornia_tidy.data.leaf_textures import make_noise_tile, make_script_tile, read_tile
 from kornia_tidy.data.photographic_leaves import ZOOM, averaged, of_most, photographic_leaves
+from kornia_tidy.data.rgbd import Scene
 
 Array = NDArray[np.float32]
 
-HEIGHT, WIDTH = 480, 640
 SCENES = ("table", "leaves")
 FOCAL_LENGTH = 1.1  # of the painted view, in widths of the picture
 PITCH = math.radians(14.0)  # the view looks down
@@ -68,19 +69,20 @@ THINGS = (
 )
 
 
-def sample_scene(name: str = "table") -> tuple[Tensor, Tensor]:
+def sample_scene(name: str = "table", height: int = 480) -> Scene:
     """Return a scene that comes with the library, painted when it is asked for.
 
     Args:
         name: ``"table"``: balls, books and boxes in sunlight on a table in front of a wall, 0.4 to 3.2 m away;
             ``"leaves"``: flat shapes from 0.3 to 10 m, by :func:`~kornia_tidy.data.photographic_leaves`.
+        height: rows in pixels; there are four thirds as many columns.
 
     Returns:
-        The image, :math:`(3, 480, 640)` float32, sRGB-encoded in [0, 1], and the depth, :math:`(1, 480, 640)` float32,
-        metres along the optical axis. The same ones at each call.
+        The image, :math:`(3, H, W)` float32, sRGB-encoded in [0, 1]; the depth, :math:`(1, H, W)` float32, metres along
+        the optical axis; and the mask of valid depth, True everywhere. Each call returns the same scene.
 
     Raises:
-        ValueError: if there is no scene of that name.
+        ValueError: if there is no scene of that name, or the height is not a positive integer.
 
     Convention:
         As :func:`~kornia_tidy.data.photographic_leaves`: painted at twice the size and averaged in linear light; depths
@@ -90,18 +92,21 @@ def sample_scene(name: str = "table") -> tuple[Tensor, Tensor]:
     and their shadows.
 
     Example:
-        >>> image, depth = sample_scene()
-        >>> image.shape, depth.shape, bool((depth > 0.3).all())
+        >>> scene = sample_scene()
+        >>> scene.image.shape, scene.depth.shape, bool((scene.depth > 0.3).all())
         (torch.Size([3, 480, 640]), torch.Size([1, 480, 640]), True)
     """
     check_choice("name of a sample scene", name, SCENES)
-    return _table() if name == "table" else photographic_leaves(HEIGHT, WIDTH, seed=4)
+    check_arguments(height, 1, (0.3, 10.0), 1, 0)
+    width = max(1, round(height * 4 / 3))
+    image, depth = _table(height, width) if name == "table" else photographic_leaves(height, width, seed=4)
+    return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
 
 
-def _table() -> tuple[Tensor, Tensor]:
+def _table(height: int, width: int) -> tuple[Tensor, Tensor]:
     """Paint the table."""
     rng = np.random.default_rng(3)
-    rays = _rays(ZOOM * HEIGHT, ZOOM * WIDTH)
+    rays = _rays(ZOOM * height, ZOOM * width)
     sun = np.array(SUN, np.float32)[:, None, None] + rng.normal(0, SUN_SPREAD, rays.shape).astype(np.float32)
     sun /= np.sqrt((sun**2).sum(0))
     tiles = make_noise_tile(rng), make_noise_tile(rng, 1.5), make_script_tile(rng)

@@ -13,7 +13,8 @@ from tests.base import BaseTester
 class TestSampleScene(BaseTester):
     @pytest.mark.parametrize("name", SCENES)
     def test_feature_is_the_same_at_each_call_and_a_whole_scene(self, name):
-        image, depth = sample_scene(name)
+        image, depth, valid = sample_scene(name)
+        assert bool(valid.all())
         assert (image.shape, depth.shape) == ((3, 480, 640), (1, 480, 640))
         assert 0 <= float(image.min()) < 0.1
         assert 0.9 < float(image.max()) <= 1
@@ -36,6 +37,16 @@ class TestSampleScene(BaseTester):
         image = sample_scene()[0]
         left, right = (image[:, 415:435, columns].mean() for columns in (slice(100, 130), slice(285, 315)))
         assert float(right) < 0.8 * float(left)
+
+    @pytest.mark.parametrize("name", SCENES)
+    def test_feature_has_another_size(self, name):
+        image, depth, _ = sample_scene(name, 12)
+        assert (image.shape, depth.shape) == ((3, 12, 16), (1, 12, 16))
+
+    @pytest.mark.parametrize("height", [0, 2.5])
+    def test_exception_height(self, height):
+        with pytest.raises(ValueError, match=f"height must be a positive integer, got {height}"):
+            sample_scene(height=height)
 
     def test_exception_unknown_name(self):
         with pytest.raises(ValueError, match=r"name of a sample scene must be one of .*, got 'desk'"):

@@ -1,4 +1,4 @@
-"""Measure all extremes and write docs/extremes.md: ``python -m tests.extremes``, some minutes on one core."""
+"""Measure all extremes and write docs/record/extremes.md: ``python -m tests.extremes``, some minutes on one core."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tqdm import tqdm
 from tests.extremes import growth
 from tests.extremes.table import all_rows, measure, page
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "record"
 
 
 def main() -> None:

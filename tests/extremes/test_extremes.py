@@ -1,4 +1,4 @@
-"""The rows of docs/extremes.md: the quick ones in every run, the others with --runslow."""
+"""The rows of docs/record/extremes.md: the quick ones in every run, the others with --runslow."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.extremes.row import Row
 from tests.extremes.table import all_rows, measure
 
 ROWS = all_rows()
-PAGE = Path(__file__).parents[2] / "docs" / "extremes.md"
+PAGE = Path(__file__).parents[2] / "docs" / "record" / "extremes.md"
 
 
 class TestExtremes:

@@ -10,7 +10,7 @@
   ``--physical --checkpoint outputs/designed/best.safetensors outputs/flat/best.safetensors --restorations network
   --designs DESIGNS``
 - ``--report`` measures nothing and writes results.md, results.csv and results.png of what is there. ``--page
-  docs/results.md`` writes the page and its picture there, too.
+  docs/record/results.md`` writes the page and its picture there, too.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--restorations", nargs="+", metavar="NAME", help="default: all that a system has")
     parser.add_argument("--report", action="store_true", help="measure nothing")
-    parser.add_argument("--page", type=Path, help="another place for the page, such as docs/results.md")
+    parser.add_argument("--page", type=Path, help="another place for the page, such as docs/record/results.md")
     return parser
 
 
