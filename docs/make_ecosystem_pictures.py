@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from kornia_tidy.cli.command_line import main as kornia_tidy
+from kornia_tidy.cli import main as kornia_tidy
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"^```(python|bash)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import torch
 
-from kornia_tidy.cli.command_line import main as kornia_tidy
+from kornia_tidy.cli import main as kornia_tidy
 
 DOCS = Path(__file__).resolve().parent
 BLOCK = re.compile(r"(<!-- slow: [^>]*-->\n)?^```(python|bash)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
 
@@ -22,11 +23,23 @@ def importer(package: str, modules: Mapping[str, Sequence[str]]) -> Callable[[st
     Raises:
         AttributeError: from that function, if the package has no such name.
 
+    Convention:
+        A public name that is also the name of its module means the public name, as it does after ``from module import``.
+
     Example:
         >>> importer("kornia_tidy", {"optics.spectrum": ["REFERENCE_WAVELENGTH"]})("REFERENCE_WAVELENGTH")
         5.3e-07
     """
     homes = {name: module for module, names in modules.items() for name in names}
+
+    class Package(ModuleType):
+        """A package that no import of a module gives the module under a public name."""
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            if not (name in homes and isinstance(value, ModuleType)):
+                super().__setattr__(name, value)
+
+    sys.modules[package].__class__ = Package
 
     def asked_for(name: str) -> Any:
         if name in homes:

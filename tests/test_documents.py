@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch
 
-from kornia_tidy.cli.command_line import main
+from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester

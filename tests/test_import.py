@@ -73,3 +73,19 @@ class TestImport(BaseTester):
         assert int(count) < 260
         assert heavy == ""
         assert len(done.stderr.splitlines()) <= 3
+
+    def test_feature_a_name_means_the_function_after_its_module_was_imported(self):
+        """Of each public name that its module shares."""
+        code = (
+            "import importlib, pkgutil, kornia_tidy\n"
+            "from types import ModuleType\n"
+            "for info in pkgutil.iter_modules(kornia_tidy.__path__, 'kornia_tidy.'):\n"
+            "    package = importlib.import_module(info.name) if info.ispkg else None\n"
+            "    for name in getattr(package, '__all__', ()):\n"
+            "        if importlib.util.find_spec(f'{info.name}.{name}'):\n"
+            "            importlib.import_module(f'{info.name}.{name}')\n"
+            "            print(info.name, name, isinstance(getattr(package, name), ModuleType))\n"
+        )
+        lines = python("-c", code).stdout.splitlines()
+        assert len(lines) >= 5
+        assert [line for line in lines if line.endswith("True")] == []
