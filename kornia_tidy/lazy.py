@@ -24,7 +24,7 @@ def importer(package: str, modules: Mapping[str, Sequence[str]]) -> Callable[[st
         AttributeError: from that function, if the package has no such name.
 
     Convention:
-        A public name that is also the name of its module means the public name, as it does after ``from module import``.
+        A public name that its module shares means the name, not the module, whatever was imported before.
 
     Example:
         >>> importer("kornia_tidy", {"optics.spectrum": ["REFERENCE_WAVELENGTH"]})("REFERENCE_WAVELENGTH")
