@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 import cv2
 import numpy as np
 import torch
+from kornia.geometry.transform import resize
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
@@ -29,6 +30,28 @@ class Scene(NamedTuple):
     """(1, H, W) float32 in metres, positive everywhere."""
     valid: Tensor
     """(1, H, W) bool, False where depth was unknown and is filled in."""
+
+    def within(self, side: int) -> Scene:
+        """Return the scene in colour, made smaller if its longer side has more pixels.
+
+        Args:
+            side: longest side in pixels.
+
+        Returns:
+            Image with three channels, averaged to the new size; depth and validity of the nearest pixel.
+
+        Example:
+            >>> grey = Scene(torch.rand(1, 40, 60), torch.ones(1, 40, 60), torch.ones(1, 40, 60, dtype=torch.bool))
+            >>> grey.within(30).image.shape
+            torch.Size([3, 20, 30])
+        """
+        image, depth, valid = self
+        if max(image.shape[1:]) > side:
+            image = resize(image[None], side, side="long", antialias=True)[0].clamp(0, 1)
+            depth, valid = (
+                resize(plane[None].float(), side, side="long", interpolation="nearest")[0] for plane in (depth, valid)
+            )
+        return Scene(image.expand(3, -1, -1), depth, valid > 0)
 
 
 def read_rgbd(

@@ -12,6 +12,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.design.candidates import FOCI, flat_candidate
 from kornia_tidy.design.design_task import DesignTask, flat_mask
+from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.design.simulated_captures import DECISION
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
@@ -23,7 +24,7 @@ from kornia_tidy.reconstruction.wiener import Wiener
 from kornia_tidy.sensor.exposure import exposed_sensor
 from kornia_tidy.sensor.noise import SensorNoise
 
-REFERENCE_F_NUMBER = 17.6  # at which electrons are counted
+REFERENCE_F_NUMBER = DesignSettings.reference_f_number  # at which electrons are counted
 BILATERAL = (7, 0.14, (2.0, 2.0))  # px, difference of encoded colours, px
 STOPS = range(-4, 3)  # quarters of a factor of two around the balanced f-number
 
@@ -97,7 +98,13 @@ def stopped_down(lens: ThinLensCamera, electrons: float) -> Camera:
         >>> round(stopped_down(ThinLensCamera(), 57_000).f_number)
         48
     """
-    task = DesignTask(lens.depth_range, lens.focal_length, lens.pixel_pitch, electrons, REFERENCE_F_NUMBER)
+    task = DesignTask(
+        depth_range=lens.depth_range,
+        focal_length=lens.focal_length,
+        pixel_pitch=lens.pixel_pitch,
+        electrons=electrons,
+        reference_f_number=REFERENCE_F_NUMBER,
+    )
     numbers = [task.balanced_f_number * 2 ** (stop / 4) for stop in STOPS]
     best = min((flat_candidate(task, number, focus) for number in numbers for focus in FOCI), key=lambda one: one.cost)
     optics = TiDyOptics(flat_mask(), task.camera(best.f_number, best.focus))

@@ -50,7 +50,7 @@ def report_data(design: CoDesign) -> dict[str, Any]:
         "gain_dB": verdict.gain,
         "standard_error_dB": verdict.standard_error,
         "scenes": verdict.scenes,
-        "full_well_electrons": design.task.full_well,
+        "full_well_electrons": design.task.capacity,
         "saturating_f_number": design.task.saturating_f_number,
         "task": task_data(design.task),
         "finalists": [
@@ -89,7 +89,7 @@ def report_markdown(design: CoDesign) -> str:
         "",
         f"Depths {near:g} to {far:g} m, lens {task.focal_length * 1e3:g} mm, pixels of {task.pixel_pitch * 1e6:g} um, "
         f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g} in the same exposure time at every "
-        f"f-number, read noise {task.read_noise_electrons:g} electrons. {exposure_in_words(design)} K = {task.masks} "
+        f"f-number, read noise {task.read_noise:g} electrons. {exposure_in_words(design)} K = {task.masks} "
         f"masks of {task.mask_size} x {task.mask_size} pixels; modulator: {_modulator_in_words(task)}. What matters: "
         f"{matters}.",
         "",
@@ -137,7 +137,7 @@ def _candidate_data(task: DesignTask, one: Candidate) -> dict[str, Any]:
 def exposure_in_words(design: CoDesign) -> str:
     """Return where the full well limits the exposure, and whether it does in a camera that was compared."""
     task = design.task
-    limit = f"White fills the well of {task.full_well:.6g} electrons at f/{task.saturating_f_number:.3g}"
+    limit = f"White fills the well of {task.capacity:.6g} electrons at f/{task.saturating_f_number:.3g}"
     bound = [one.candidate.f_number for one in design.finalists if one.candidate.f_number < task.saturating_f_number]
     if not bound:
         return f"{limit}, a wider aperture than any that was compared."

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_metres, check_part, check_positive
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.design.settings import LARGEST_MASK, MOST_MASKS, DesignSettings
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
@@ -19,32 +20,19 @@ from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
 from kornia_tidy.sensor.noise import SensorNoise
 
-MOST_MASKS = 64
-LARGEST_MASK = 1024  # pixels along a side: a search with more would take days
 SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
 _PER_FOCAL_LENGTH = 1.22 * 2  # Airy disc: diameter / (wavelength * f-number)
 
 
-@dataclass(frozen=True)
-class DesignTask:
+@dataclass(frozen=True, kw_only=True)
+class DesignTask(DesignSettings):
     """Given quantities of a co-design of aperture, focus and masks. Lengths in metres, light in electrons.
 
     Args:
-        depth_range: nearest and farthest depth. The farthest may be ``inf``.
-        focal_length: of the lens.
-        pixel_pitch: of the sensor.
-        electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number, but
-            for those at which white would exceed the full well: there it is shorter.
-        reference_f_number: f-number at which the electrons were counted.
-        read_noise_electrons: standard deviation.
-        masks: number K of masks in one exposure.
         modulator: shows the masks, with its switching, levels and losses. Default: equal dwell times without delay.
             The flat lens, to which masks are compared, has none.
         statistics: of the scenes: power spectrum, light, and the distribution of inverse depth over the range.
-        depth_weight: share of depth in what matters: 0 is the image alone, 1 depth alone.
-        mask_size: pixels along a side of a mask.
-        full_well_electrons: capacity of a pixel. Default: that of a common pixel of this pitch, see
-            :func:`kornia_tidy.sensor.full_well_of`.
+        settings: the others, as in :class:`~kornia_tidy.design.settings.DesignSettings`.
 
     Raises:
         ValueError: if a value is out of its range, a length is not in metres, or nothing is out of focus.
@@ -59,18 +47,8 @@ class DesignTask:
         ValueError: focal_length must be metres between 1e-05 and 10 (50 mm is 50e-3), got 50
     """
 
-    depth_range: tuple[float, float] = (0.2975, math.inf)
-    focal_length: float = 50e-3
-    pixel_pitch: float = 8e-6
-    electrons: float = 57_000
-    reference_f_number: float = 17.6
-    read_noise_electrons: float = 2.4
-    masks: int = 5
     modulator: nn.Module = field(default_factory=DwellTimes)
     statistics: SceneStatistics = PHOTOGRAPHS
-    depth_weight: float = 0.0
-    mask_size: int = 23
-    full_well_electrons: float | None = None
 
     def __post_init__(self) -> None:
         check_metres("focal_length", self.focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
@@ -84,8 +62,8 @@ class DesignTask:
         timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
         if not 0 <= self.depth_weight <= 1:
             raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")
-        if self.full_well_electrons is not None:
-            check_positive("full_well_electrons", self.full_well_electrons)
+        if self.full_well is not None:
+            check_positive("full_well", self.full_well)
         self.sensor(self.reference_f_number)  # refuses light and noise out of range
         self.camera(max(self.reference_f_number, FASTEST), 0.5)  # and depths out of order
         near, far = self.depth_range
@@ -137,18 +115,18 @@ class DesignTask:
 
     def sensor(self, f_number: float) -> SensorNoise:
         """Return the sensor, with the light that the f-number admits. See :func:`exposed_sensor`."""
-        light = self.electrons, self.reference_f_number, self.read_noise_electrons
-        return exposed_sensor(f_number, *light, self.full_well)
+        light = self.electrons, self.reference_f_number, self.read_noise
+        return exposed_sensor(f_number, *light, self.capacity)
 
     @property
-    def full_well(self) -> float:
+    def capacity(self) -> float:
         """Capacity of a pixel in electrons."""
-        return full_well_of(self.pixel_pitch) if self.full_well_electrons is None else self.full_well_electrons
+        return full_well_of(self.pixel_pitch) if self.full_well is None else self.full_well
 
     @property
     def saturating_f_number(self) -> float:
         """F-number at which white just fills the well; at wider apertures the exposure is shorter."""
-        return self.reference_f_number * math.sqrt(self.electrons / self.full_well)
+        return self.reference_f_number * math.sqrt(self.electrons / self.capacity)
 
     def noise(self, f_number: float) -> float:
         """Return the standard deviation of the noise at the scenes' mean light, full scale 1."""

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import torch
 
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.figures.depth import draw_depth
-from kornia_tidy.figures.style import save_figure
+from kornia_tidy.figures.style import require_matplotlib, save_figure
+from kornia_tidy.files import parse_json, remove_leftovers, write_bytes
 from kornia_tidy.lab.capture_file import CaptureLight
-from kornia_tidy.reconstruction.light_head import LightHead, Reconstruction, UncertainReconstruction
+from kornia_tidy.lab.file_jobs import Row, output_paths, work_on_all
+from kornia_tidy.reconstruction.light_head import (
+    LightHead,
+    Reconstruction,
+    UncertainReconstruction,
+    reconstruct_light,
+    with_noise_of,
+)
 from kornia_tidy.reconstruction.tasks import MAPS
+from kornia_tidy.reconstruction.tiled import OVERLAP
 
 SMALLEST_DEVIATION = 1e-9  # m
 
@@ -89,3 +103,87 @@ def reconstruction_in_words(head: LightHead, depth_unit: float = 1e-3) -> dict[s
             words["deviation_png"] = f"metres = value * {unit:g}; 65535 is {65535 * unit:g} m or more, or unbounded"
         words["depth_range"] = f"{near:g} to {far:g} m: the camera's; nearer and farther have its ends"
     return words
+
+
+def reconstruct_files(
+    files: Sequence[str],
+    folder: Path,
+    head: LightHead,
+    read: Callable[[str], CaptureLight],
+    *,
+    words: Mapping[str, Any] | None = None,
+    made_by: Mapping[str, Any] | None = None,
+    resume: bool = False,
+    picture: str = ".png",
+    depth_unit: float = 1e-3,
+    jobs: int = 1,
+    memory_budget: int = 512 << 20,
+    overlap: int = OVERLAP,
+) -> list[Row]:
+    """Reconstruct captures of files into a folder, several at a time, and go on after errors.
+
+    Args:
+        files: captures.
+        folder: gets the files of :func:`reconstruction_suffixes` for each, and last a JSON file that describes them;
+            made if missing.
+        head: the network.
+        read: from a file to its light, such as :func:`~kornia_tidy.lab.capture_file.read_light`.
+        words: more for the JSON files.
+        made_by: what results depend on beside their file, as plain values.
+        resume: keep results that are complete, of the same file and ``made_by``.
+        picture: suffix of the picture of 16 bits.
+        depth_unit: metres of a unit of depth in PNG files.
+        jobs: files at a time, each in a thread.
+        memory_budget: bytes for the network's tiles, of all jobs.
+        overlap: pixels of a tile that are discarded at each cut.
+
+    Returns:
+        For each file ``"done"``, ``"kept"``, or the sentence of its error, which is printed too.
+
+    Raises:
+        ValueError: if two files would get the same results, or one would be replaced.
+    """
+    suffixes = reconstruction_suffixes(head.task, picture, uncertain=head.uncertain)
+    if "_depth_colors.png" in suffixes:
+        require_matplotlib()
+    outputs = output_paths(files, folder, [*suffixes, ".json"])
+    folder.mkdir(parents=True, exist_ok=True)
+    if resume:
+        remove_leftovers(folder)
+    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
+
+    def work(path: str, progress: Callable[[int, int], None]) -> Row:
+        start, paths = time.perf_counter(), outputs[path]
+        made_of = json.loads(json.dumps({"source": _identity(path), "made_by": made_by or {}}))
+        if resume and _is_finished(paths, made_of):
+            return Row(path, "kept")
+        capture = read(path)
+        options: dict[str, Any] = {"memory_budget": memory_budget // jobs, "overlap": overlap, "progress": progress}
+        own = with_noise_of(head, capture.noise)  # no other thread's
+        result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
+        size = write_reconstruction(paths[:-1], result, capture, head, depth_unit)
+        record = {**made_of, "size": size, **(words or {}), **reconstruction_in_words(head, depth_unit)}
+        record |= {"noise": capture.noise.extra_repr()} if capture.noise is not None else {}
+        write_bytes(paths[-1], (json.dumps(record, indent=1) + "\n").encode())
+        return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
+
+    return work_on_all("reconstruct", list(outputs), work, jobs)
+
+
+def _is_finished(paths: Sequence[Path], made_of: Mapping[str, Any]) -> bool:
+    """Return whether all results of a file exist, made of the same file with the same settings."""
+    if not all(path.is_file() for path in paths):
+        return False
+    try:
+        record = parse_json(paths[-1].read_bytes())
+    except ValueError:
+        return False
+    return isinstance(record, dict) and all(record.get(name) == value for name, value in made_of.items())
+
+
+def _identity(path: str) -> dict[str, Any]:
+    """Return the identity of an input file, to recognise it on resuming."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    state = Path(path).stat()
+    return {"file": Path(path).name, "bytes": state.st_size, "modified": state.st_mtime_ns}

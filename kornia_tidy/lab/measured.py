@@ -13,6 +13,7 @@ from torch import nn
 
 from kornia_tidy.checks import check_choice, check_part
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+from kornia_tidy.lab.capture_file import CaptureLight
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
@@ -127,6 +128,26 @@ def with_measurements(
 def takes_psfs(head: nn.Module) -> bool:
     """Return whether a network deconvolves captures with the PSFs of its camera."""
     return any(isinstance(module, ClosedForm | LayeredJointHead | Refocused) for module in head.modules())
+
+
+def check_capture(system: TrainedSystem, path: str, capture: CaptureLight) -> None:
+    """Check that a capture is of the camera whose PSFs were measured.
+
+    Args:
+        system: with measured PSFs, see :func:`closed_form_system` and :func:`with_measurements`.
+        path: of the capture, for the error.
+        capture: as it was read.
+
+    Raises:
+        ValueError: if it has other colours than the PSFs, or a closed form lacks its noise.
+    """
+    measured = system.optics.psf_model.measured
+    assert measured is not None
+    colors, channels = len(capture.light), measured.psfs.shape[1]
+    if colors != channels:
+        raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
+    if capture.noise is None and not system.step:
+        raise ValueError(f"the noise of {path} is not known: give --noise")
 
 
 def _check_lens(measured: ThinLensCamera, own: ThinLensCamera) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
+from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS, FIXED
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.settings import Count, CountOrNone, Factor, FNumber, Pixels, Unit, one_of
@@ -95,7 +96,7 @@ class LightSettings:
     noise_range: Annotated[tuple[float, float], Unit("LEAST LARGEST", "", 0, 1, above=True)] = (1e-3, 0.03)
     noise_error: Annotated[float, Unit("X", "", 1)] = 2.5
     electrons: Annotated[tuple[float, float], Unit("LEAST LARGEST", "electrons", 0, above=True)] | None = None
-    reference_f_number: FNumber = 17.6
+    reference_f_number: FNumber = DesignSettings.reference_f_number
 
     def check_light(self) -> None:
         """Raise ``ValueError`` if the ends of a range are out of order."""

@@ -148,7 +148,7 @@ class TestDesignFiles(BaseTester):
         assert report.count("\n| ") == 2 + len(dim.finalists) + len(dim.candidates)
         assert "electrons at f/" in report
         assert "a wider aperture than any that was compared" in report
-        full = replace(dim, task=replace(dim.task, full_well_electrons=dim.task.electrons / 100))
+        full = replace(dim, task=replace(dim.task, full_well=dim.task.electrons / 100))
         assert "wider apertures are exposed for a shorter time" in design_files(full)[REPORT].decode()
         assert all(len(line) < 200 for line in report.splitlines() if line.startswith("|"))
 

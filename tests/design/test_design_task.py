@@ -21,12 +21,12 @@ class TestDesignTask(BaseTester):
             ({"depth_range": (0.06, 5)}, "depth_range must begin beyond two focal lengths, 0.1 m, got 0.06 m"),
             ({"depth_range": (2, 1)}, "depth_range must be .* with 0 < near < far"),
             ({"electrons": 0}, "electrons must be positive"),
-            ({"read_noise_electrons": -1}, "sigma must be zero or positive"),
+            ({"read_noise": -1}, "sigma must be zero or positive"),
             ({"masks": 0}, "masks must be a whole number from 1 to 64, got 0"),
             ({"mask_size": 0}, "mask_size must be a whole number from 1 to 1024, got 0"),
             ({"mask_size": 5000}, "mask_size must be a whole number from 1 to 1024, got 5000"),
             ({"mask_size": 23.0}, "mask_size must be a whole number from 1 to 1024, got 23.0"),
-            ({"full_well_electrons": 0}, "full_well_electrons must be positive and finite, got 0"),
+            ({"full_well": 0}, "full_well must be positive and finite, got 0"),
             ({"depth_weight": 1.5}, r"depth_weight must be from 0 \(image alone\) to 1 \(depth alone\), got 1.5"),
         ],
     )
@@ -54,7 +54,7 @@ class TestDesignTask(BaseTester):
     @pytest.mark.parametrize("depth_range", [(0.2975, math.inf), (1.2, math.inf), (0.4, 1.0)])
     def test_feature_the_best_flat_lens_in_bright_light_is_near_the_balanced_one(self, depth_range):
         """The geometric estimate is right to within one stop."""
-        task = DesignTask(depth_range=depth_range, electrons=1e7, read_noise_electrons=0.1)
+        task = DesignTask(depth_range=depth_range, electrons=1e7, read_noise=0.1)
         stops = [step / 4 for step in range(-8, 9)]
         errors = {stop: flat_candidate(task, task.balanced_f_number * 2**stop, 0.5).image_error for stop in stops}
         assert abs(min(errors, key=lambda stop: errors[stop])) <= 0.5
@@ -75,7 +75,7 @@ class TestDesignTask(BaseTester):
         task = DesignTask()
         assert task.sensor(3.39).full_well == full_well_of(8e-6)
         assert task.sensor(35.2).full_well == 57_000 / 4
-        small = DesignTask(full_well_electrons=20_000)
+        small = DesignTask(full_well=20_000)
         assert small.sensor(17.6).full_well == 20_000
         assert small.sensor(small.saturating_f_number * 1.001).full_well < 20_000
         assert small.noise(5.0) == small.noise(17.6)

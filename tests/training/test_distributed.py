@@ -47,9 +47,9 @@ class TestTwoProcesses(BaseTester):
         stages = ["--pretrain-epochs", "1", "--epochs"]
         assert main(["train", *small, *stages, "2", "--accumulate", "2", "-o", str(tmp_path / "one")]) == 0
         two = ["--devices", "2", "-o", str(tmp_path / "two")]
-        torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "kornia_tidy.cli"]
+        torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "kornia_tidy"]
         for command in (
-            ["kornia_tidy.cli", "train", *small, *stages, "1", *two],
+            ["kornia_tidy", "train", *small, *stages, "1", *two],
             [*torchrun, "train", "--resume", "--epochs", "2", *two],
         ):
             done = subprocess.run(

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.geometry.transform import resize
 from torch import Tensor
 
 from kornia_tidy.data.depth_files import read_depth
@@ -98,9 +97,4 @@ def read_files(
             f"the middle depth of {Path(depth_file).name} would be {middle:.3g} m, where {PLAUSIBLE[0]:g} to "
             f"{PLAUSIBLE[1]:g} m are plausible: choose another unit of the depth map"
         )
-    if max(image.shape[1:]) > side:
-        image = resize(image[None], side, side="long", antialias=True)[0].clamp(0, 1)
-        depth, valid = (
-            resize(plane[None].float(), side, side="long", interpolation="nearest")[0] for plane in (depth, valid)
-        )
-    return Scene(image.expand(3, -1, -1), depth, valid > 0)
+    return Scene(image, depth, valid).within(side)

@@ -10,9 +10,12 @@ from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.choices import STARTS
 from kornia_tidy.data.dead_leaves import MOST_LEAVES, PIXELS_A_LEAF
 from kornia_tidy.optics.published_systems import SYSTEMS
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.pretrained import PRETRAINED
+from kornia_tidy.reconstruction.settings import MaskSettings
 from kornia_tidy.render.compositing import COMPOSITING
 
+LENS = ThinLensCamera()
 OWN, FLAT, FILES, CHART = "own", "flat", "files", "test chart"
 SCENES = ("dead leaves", "photographic leaves", CHART, FILES)
 CAMERAS = (*PRETRAINED, *SYSTEMS, OWN)
@@ -76,13 +79,13 @@ class Settings:
     near: float = 0.3
     far: float = 10.0
     camera: str = "joint-5"
-    f_number: float = 17.6
-    focus_distance: float = 0.595
-    focal_length: float = 0.05
-    pixel_pitch: float = 8e-6
+    f_number: float = round(LENS.f_number, 1)
+    focus_distance: float = float(LENS.focus_distance)
+    focal_length: float = LENS.focal_length
+    pixel_pitch: float = LENS.pixel_pitch
     fit: bool = False
     start: str = "like fishers"
-    masks: int = 5
+    masks: int = MaskSettings.masks
     mask_seed: int = 0
     compositing: str = AS_SYSTEM
     noise: float = 0.002

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.cli.commands.shared import Folder, OwnScene, check_folder
+from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.settings import Pixels, Seed, Unit
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Demo:
     """
 
     output: Folder = "outputs"
-    electrons: Annotated[float, Unit("E", "electrons", 0, above=True)] = 57_000.0
+    electrons: Annotated[float, Unit("E", "electrons", 0, above=True)] = DesignSettings.electrons
     size: Pixels = 512
     seed: Seed = 5  # of a scene of many kinds of texture
     scene: OwnScene = field(default_factory=OwnScene)
@@ -117,24 +118,14 @@ class Demo:
 
     def _scene(self, camera: ThinLensCamera) -> Scene:
         """Return a colour scene with depths stretched over the camera's range."""
-        from kornia.geometry.transform import resize
-
         from kornia_tidy.data.photographic_leaves import PhotographicLeaves
-        from kornia_tidy.data.rgbd import Scene
         from kornia_tidy.reconstruction.tasks import stretched
 
         own = self.scene.read()
         if own is None:
             return PhotographicLeaves(1, self.size, self.size, depth_range=camera.depth_range, seed=self.seed).read(0)
-        image, depth, valid = own
-        if max(image.shape[-2:]) > LARGEST:
-            image = resize(image[None], LARGEST, side="long", antialias=True)[0].clamp(0, 1)
-            depth, valid = (
-                resize(plane[None].float(), LARGEST, side="long", interpolation="nearest")[0]
-                for plane in (depth, valid)
-            )
-        valid = valid > 0
-        return Scene(image.expand(3, -1, -1), stretched(depth, valid, camera), valid)
+        own = own.within(LARGEST)
+        return own._replace(depth=stretched(own.depth, own.valid, camera))
 
 
 def _write(folder: Path, pictures: Mapping[str, Tensor], pages: Mapping[str, bytes]) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import BETWEEN
 from kornia_tidy.cli.commands.shared import Folder, check_folder
-from kornia_tidy.settings import DepthRange, Electrons, FNumber, Metres, Seconds, Seed, Unit, one_of
+from kornia_tidy.design.settings import DesignSettings
+from kornia_tidy.settings import Seconds, Seed, Unit, one_of
 
 if TYPE_CHECKING:
     from torch import nn
@@ -22,41 +22,16 @@ PROGRESS = "progress.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensAndSensor:
-    """Lens and sensor.
-
-    Args:
-        focal_length: of the lens.
-        pixel_pitch: of the sensor.
-        electrons: of a white pixel at the reference f-number.
-        reference_f_number: f-number at which the electrons are counted.
-        full_well: electrons from black to white, which limit the exposure. None: by the pixel's area, 57000 at 8 um.
-        read_noise: its standard deviation.
-    """
-
-    focal_length: Metres = 0.05
-    pixel_pitch: Metres = 8e-6
-    electrons: Electrons = 57_000.0
-    reference_f_number: FNumber = 17.6
-    full_well: Electrons | None = None
-    read_noise: Electrons = 2.4
-
-
-@dataclass(frozen=True, kw_only=True)
 class ModulatorSettings:
     """Modulator.
 
     Args:
-        masks: in one exposure.
-        mask_size: pixels along a side of a mask, 20 of 23 of which span the aperture: more scatter less light.
         bits: of its grey levels over one wave. None: any phase.
         switching_time: from mask to mask.
         exposure: of a capture.
         between: phase while it switches.
     """
 
-    masks: Annotated[int, Unit("K", "", 1, 64)] = 5
-    mask_size: Annotated[int, Unit("N", "", 1, 1024)] = 23
     bits: Annotated[int, Unit("B", "", 1)] | None = None
     switching_time: Seconds = 0.0
     exposure: Seconds = 0.1
@@ -99,21 +74,17 @@ class Design:
         output: made if missing.
         quick: fewer steps and scenes: a first answer, in 20 s on one core.
         seed: of all that is random.
-        depth_range: nearest and farthest depth that the camera is for; the farthest may be inf.
-        depth_weight: share of depth in what matters, from 0, the image alone, to 1.
         scenes: pictures with depth, which decide beside dead leaves; FOLDER/rgbd.json pairs them: {"image": "*.png",
             "depth": "*_depth.png", "scale": 0.001}. None: dead leaves alone.
-        sensor: lens and sensor.
+        given: scene, lens and sensor.
         modulator: what shows the masks.
     """
 
     output: Folder = "outputs/design"
     quick: bool = False
     seed: Seed = 0
-    depth_range: DepthRange = (0.2975, math.inf)
-    depth_weight: Annotated[float, Unit("W", "", 0, 1)] = 0.0
     scenes: Folder | None = None
-    sensor: LensAndSensor = field(default_factory=LensAndSensor)
+    given: DesignSettings = field(default_factory=DesignSettings)
     modulator: ModulatorSettings = field(default_factory=ModulatorSettings)
 
     notes: ClassVar = """\
@@ -149,19 +120,7 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         """
         from kornia_tidy.design.design_task import DesignTask
 
-        return DesignTask(
-            depth_range=self.depth_range,
-            focal_length=self.sensor.focal_length,
-            pixel_pitch=self.sensor.pixel_pitch,
-            electrons=self.sensor.electrons,
-            reference_f_number=self.sensor.reference_f_number,
-            read_noise_electrons=self.sensor.read_noise,
-            masks=self.modulator.masks,
-            modulator=self.modulator.modulator(),
-            depth_weight=self.depth_weight,
-            mask_size=self.modulator.mask_size,
-            full_well_electrons=self.sensor.full_well,
-        )
+        return DesignTask(**vars(self.given), modulator=self.modulator.modulator())
 
     def run(self) -> None:
         """Design, and write the files."""

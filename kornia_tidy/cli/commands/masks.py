@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from kornia_tidy.choices import FLIPS, MATERIALS, ROTATIONS
-from kornia_tidy.cli.commands.parser import Argument, Parsed
+from kornia_tidy.cli.commands.parser import Argument
+from kornia_tidy.cli.commands.raw_options import Size
 from kornia_tidy.cli.commands.shared import File
 from kornia_tidy.settings import Metres, Seconds, Unit, one_of
 
@@ -23,19 +23,6 @@ MasksFile = Annotated[str, Argument("MASKS")]
 MaterialName = Annotated[str, one_of(MATERIALS)]
 
 
-def panel_size(text: str) -> tuple[int, int]:
-    """Read the pixels of a panel.
-
-    Example:
-        >>> panel_size("1920x1200")
-        (1920, 1200)
-    """
-    match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
-    if match is None:
-        raise ValueError(f"must be WIDTHxHEIGHT in pixels, such as 1920x1200, got {text!r}")
-    return int(match[1]), int(match[2])
-
-
 @dataclass(frozen=True, kw_only=True)
 class Panel:
     """Panel (frames).
@@ -46,7 +33,7 @@ class Panel:
         phase_range: phase at that wavelength that the levels span. None: as saved, or 2 pi.
         response: instead: its measured phases at that wavelength, as text: one for each level, or two columns, level
             and phase; radians, or the unit that a header names (deg, pi, waves). None: levels that are evenly spaced.
-        panel: its size.
+        panel: its size. None: 1920x1200.
         panel_pitch: distance of its pixels.
         offset: of the mask's centre from the panel's.
         flip: mirror the mask first.
@@ -58,7 +45,7 @@ class Panel:
     wavelength: Metres = 530e-9
     phase_range: Annotated[float, Unit("RAD", "radians", 0, above=True)] | None = None
     response: File | None = None
-    panel: Annotated[tuple, Parsed("WxH", "pixels", read=panel_size)] = (1920, 1200)
+    panel: Size | None = None
     panel_pitch: Metres = 8e-6
     offset: Annotated[tuple[int, int], Unit("RIGHT DOWN", "panel pixels")] = (0, 0)
     flip: Annotated[str, one_of(FLIPS)] = "none"
@@ -203,7 +190,7 @@ class ExportMasks:
         response = None if asked.response is None else read_response(asked.response, asked.bits or 8)
         levels = saved.levels(asked.wavelength, asked.bits, asked.phase_range, response)
         times = saved.times(timing.exposure, timing.switching_time, timing.dwell, timing.cyclic)
-        width, height = asked.panel
+        height, width = asked.panel or (1200, 1920)
         placement = PanelPlacement(
             (height, width), asked.panel_pitch, self.pupil_radius, asked.offset, asked.flip, asked.rotate
         )

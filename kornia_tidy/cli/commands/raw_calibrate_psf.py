@@ -9,30 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.cli.commands.parser import Given
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
-from kornia_tidy.cli.commands.shared import File, Noise, Window, check_outputs, read_noise
+from kornia_tidy.cli.commands.shared import File, SensorInElectrons, Window, check_outputs
 from kornia_tidy.reconstruction.settings import LensSettings
-from kornia_tidy.settings import Count, Electrons, Metres, Seconds, Unit
+from kornia_tidy.settings import Count, Metres, Seconds, Unit
 
 if TYPE_CHECKING:
     from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.lab.calibration.psf.point_files import Picture
-    from kornia_tidy.sensor.noise import SensorNoise
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoiseOfSensor:
-    """Noise of the sensor.
-
-    Args:
-        full_well: electrons from black to white. None: as noise says.
-        read_noise: its standard deviation. None: as noise says.
-        noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
-            calibrate-noise wrote. None: by full_well and read_noise.
-    """
-
-    full_well: Electrons | None = None
-    read_noise: Electrons | None = None
-    noise: Noise | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +61,7 @@ class CalibratePsf:
     fit_mask: Annotated[str, Unit("NPY")] | None = None
     mask_size: Count = 23
     diameter: Annotated[float, Unit("M", "metres", 0)] = 0.0
-    sensor: NoiseOfSensor = field(default_factory=NoiseOfSensor)
+    sensor: SensorInElectrons = field(default_factory=SensorInElectrons)
     lens: Annotated[dict[str, Any], Given(LensSettings, but=("depth_range",))] = field(default_factory=dict)
     dump: Dump = field(default_factory=Dump)
 
@@ -124,7 +107,7 @@ In Python:
         depths = (0.99 * min(self.distances), 1.01 * max(self.distances))
         focus = float(lens.focus_distance)
         camera = ThinLensCamera(lens.focal_length, lens.aperture_diameter, focus, lens.pixel_pitch, depths)
-        sensor, calibration = self._sensor()
+        sensor, calibration = self.sensor.noise_of()
         stages = Stages()
         with stages("measure"):
             images = images_of_files(
@@ -148,11 +131,11 @@ In Python:
         )
         fit = None
         if self.fit_mask is not None:
-            from kornia_tidy.lab.calibration.psf.phase_retrieval import retrieve_mask
+            from kornia_tidy.lab.calibration.psf.phase_retrieval import retrieve_mask, spectrum_of
             from kornia_tidy.lab.mask_export.mask_files import write_heights
 
             with stages("mask"):
-                fit = retrieve_mask(measured.bank, camera, _spectrum(channels), self.mask_size)
+                fit = retrieve_mask(measured.bank, camera, spectrum_of(channels), self.mask_size)
             for distance, left in zip(measured.distances, fit.residual, strict=True):
                 words = " ".join(f"{100 * float(x):.2g}" for x in left)
                 tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
@@ -195,21 +178,6 @@ In Python:
                 f"{len(self.reference)}"
             )
 
-    def _sensor(self) -> tuple[SensorNoise, PhotonTransfer | None]:
-        """Return the noise of the settings, and its calibration if it was measured."""
-        from kornia_tidy.sensor.noise import SensorNoise
-
-        full_well, read = self.sensor.full_well, self.sensor.read_noise
-        if self.sensor.noise is None:
-            if full_well is None or read is None:
-                raise ValueError("the noise of the sensor is needed: --noise, or --full-well and --read-noise")
-            return SensorNoise.physical(full_well, read), None
-        if full_well is not None or read is not None:
-            raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
-        sensor, calibration = read_noise(self.sensor.noise)
-        assert sensor is not None
-        return sensor, calibration
-
     def _read(self, path: str, calibration: PhotonTransfer | None) -> Picture:
         """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
         from kornia_tidy.data.image_files import SUFFIXES, read_image
@@ -221,11 +189,3 @@ In Python:
         if calibration is not None:
             calibration.check_taken_alike(raw, path)
         return planes_of_tile(raw, path)
-
-
-def _spectrum(channels: int) -> Any:
-    from kornia_tidy.optics.spectrum import Spectrum
-
-    if channels not in {1, 3}:
-        raise ValueError(f"--fit-mask needs PSFs of 1 or 3 channels, these have {channels}")
-    return Spectrum.monochrome() if channels == 1 else Spectrum.rgb()

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from kornia_tidy.choices import ADAPTATIONS, DEMOSAIC, HIGHLIGHTS
-from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, for_each_file, white_balance
+from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
 from kornia_tidy.cli.commands.shared import Folder
 from kornia_tidy.settings import one_of
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from kornia_tidy.lab.raw.capture import RawCapture
 
 SUFFIXES = {"png": ".png", "tiff": ".tif"}
 Format = Annotated[str, one_of(("png", "tiff"))]
@@ -87,7 +81,9 @@ The first example in Python:
 
         from kornia_tidy.cli.commands.report import Stages, tell
         from kornia_tidy.data.image_files import write_image
+        from kornia_tidy.lab.file_jobs import for_each_file, output_paths
         from kornia_tidy.lab.raw.develop import develop, encode
+        from kornia_tidy.lab.raw.properties import clipped_in_words, colors_in_words
 
         balance = white_balance(self.white_balance)
         folder = Path(self.output)
@@ -138,54 +134,3 @@ The first example in Python:
             missing = len(outputs) - sum(done.values())
             tell("files", f"{done['developed']} developed, {done['kept']} kept, {missing} failed or left")
             tell("time", stages.summary())
-
-
-def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
-    """Return the output paths of each file.
-
-    Raises:
-        ValueError: if two files would become the same picture, or a picture would replace one of the files.
-    """
-    outputs: dict[str, list[Path]] = {}
-    owners: dict[str, str] = {}
-    for path in dict.fromkeys(files):
-        stem = Path(path).stem
-        if stem in owners:
-            raise ValueError(f"{owners[stem]} and {path} would both become {folder / stem}{suffixes[0]}")
-        owners[stem] = path
-        outputs[path] = [folder / f"{stem}{suffix}" for suffix in suffixes]
-    taken = {Path(path).resolve() for path in files}
-    for output in (output for each in outputs.values() for output in each):
-        if output.resolve() in taken:
-            raise ValueError(f"cannot write {output}: it is an input")
-    return outputs
-
-
-def colors_in_words(raw: RawCapture, demosaic: str | None, balance: str | Tensor | None) -> str:
-    """Describe the colour matrix and the white balance of a picture."""
-    from kornia_tidy.lab.raw.color import ASSUMED_CAMERA
-    from kornia_tidy.lab.raw.develop import balance_factors, default_method, matrix_origin
-
-    if not raw.colors:
-        return "monochrome"
-    factors = balance_factors(raw, balance)
-    shown = " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, factors.tolist(), strict=True))
-    method = "no filter array" if raw.pattern is None else demosaic or default_method(raw)
-    matrix = {
-        "file": "the file's matrix",
-        "model": "LibRaw's matrix of the camera",
-        "assumed": f"no matrix: that of {ASSUMED_CAMERA} is assumed",
-    }[matrix_origin(raw)]
-    return f"{method}, white balance {shown}, {matrix}"
-
-
-def clipped_in_words(image: Tensor) -> str:
-    """Describe the share of a linear picture that a file of [0, 1] clips.
-
-    Example:
-        >>> import torch
-        >>> clipped_in_words(torch.tensor([[[-0.1, 0.5, 1.0, 1.2]]]))
-        '25 % of its values lie above white and 25 % below black, and are clipped'
-    """
-    above, below = (100 * float(share.float().mean()) for share in (image > 1, image < 0))
-    return f"{above:.3g} % of its values lie above white and {below:.3g} % below black, and are clipped"

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, for_each_file
+from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +42,7 @@ class InfoOfRaw:
     def run(self) -> None:
         """Print the properties of raw files."""
         from kornia_tidy.cli.commands.report import tell
+        from kornia_tidy.lab.file_jobs import for_each_file
         from kornia_tidy.lab.raw.properties import raw_in_words, raw_properties
 
         objects: list[dict[str, Any]] = []

@@ -1,10 +1,9 @@
-"""Settings of the raw commands: headerless dumps, and a loop over files."""
+"""Settings of the raw commands: headerless dumps, sizes and white balance."""
 
 from __future__ import annotations
 
 import re
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -111,23 +110,3 @@ def white_balance(words: Sequence[str]) -> str | Tensor | None:
 
 
 WhiteBalance = Annotated[tuple[str, ...], Unit("WB")]
-
-
-def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
-    """Apply an action to every file, and go on after errors.
-
-    Raises:
-        OSError, ValueError: the error of a single file; for several files the number that failed, after their errors
-            have been printed.
-    """
-    failed = 0
-    for path in paths:
-        try:
-            work(path)
-        except (OSError, ValueError) as error:
-            if len(paths) == 1:
-                raise
-            failed += 1
-            print(f"kornia-tidy: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
-    if failed:
-        raise ValueError(f"{failed} of {len(paths)} files failed")

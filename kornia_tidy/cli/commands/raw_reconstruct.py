@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import ORIENTATIONS, PRETRAINED
-from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format, output_paths
+from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
 from kornia_tidy.cli.commands.shared import File, Folder, Noise, read_noise
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
-    from kornia_tidy.reconstruction.light_head import LightHead
-    from kornia_tidy.reconstruction.trained import TrainedSystem
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.lab.capture_file import CaptureLight
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,15 +123,13 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         """Reconstruct captures."""
         import torch
 
-        from kornia_tidy.cli.commands.file_jobs import Row, table, work_on_all
         from kornia_tidy.cli.commands.report import tell
-        from kornia_tidy.cli.commands.system_options import load_system
-        from kornia_tidy.figures.reconstruction_files import reconstruction_suffixes
-        from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.files import remove_leftovers
-        from kornia_tidy.lab.measured import takes_psfs
+        from kornia_tidy.cli.commands.system_options import CLOSED_FORM, load_system
+        from kornia_tidy.figures.reconstruction_files import reconstruct_files
+        from kornia_tidy.lab.file_jobs import table
+        from kornia_tidy.lab.measured import check_capture, takes_psfs
         from kornia_tidy.reconstruction.head import takes_noise
-        from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
+        from kornia_tidy.reconstruction.light_head import LightHead
 
         white_balance(self.white_balance)  # refuses what is none
         if self.noise == 0:
@@ -148,30 +141,31 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         if self.psfs is not None and not takes_psfs(system.head):
             raise ValueError(f"--psfs is for a network that deconvolves captures, and that of {self.head} does not")
         head = LightHead(system, orientations=self.orientations).to(torch.device(self.device))
-        suffixes = reconstruction_suffixes(system.settings.task, SUFFIXES[self.format], uncertain=head.uncertain)
-        if "_depth_colors.png" in suffixes:
-            require_matplotlib()
+
+        def read(path: str) -> CaptureLight:
+            capture = self._read(path)
+            if self.psfs is not None:
+                check_capture(system, path, capture)
+            return capture
+
+        words = {"head": self.head or CLOSED_FORM} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
         folder = Path(self.output)
-        outputs = output_paths(self.files, folder, [*suffixes, ".json"])  # which is written last
-        made_by = self._made_by()
-        folder.mkdir(parents=True, exist_ok=True)
-        if self.resume:
-            remove_leftovers(folder)
-        reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
+        rows = reconstruct_files(
+            self.files,
+            folder,
+            head,
+            read,
+            words=words,
+            made_by=self._made_by(),
+            resume=self.resume,
+            picture=SUFFIXES[self.format],
+            depth_unit=self.depth_unit,
+            jobs=self.jobs,
+            memory_budget=self.memory << 20,
+            overlap=self.overlap,
+        )
         name = self.head or self.psfs
         tell("network", f"{name}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
-
-        def work(path: str, progress: Callable[[int, int], None]) -> Row:
-            start = time.perf_counter()
-            said = json.loads(json.dumps({"source": _identity(path), "made_by": made_by}))
-            paths = outputs[path]
-            if self.resume and is_finished(paths, said):
-                return Row(path, "kept")
-            options = {"memory_budget": (self.memory << 20) // self.jobs, "overlap": self.overlap, "progress": progress}
-            size = self._reconstruct(path, paths, said, head, system, options)
-            return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
-
-        rows = work_on_all("reconstruct", list(outputs), work, self.jobs)
         failed = sum(row.result not in {"done", "kept"} for row in rows)
         for line in table(rows):
             print(line)
@@ -179,36 +173,20 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         if failed:
             raise ValueError(f"{failed} of {len(rows)} files failed")
 
-    def _reconstruct(
-        self, path: str, paths: list[Path], said: dict[str, Any], head: LightHead, system: TrainedSystem, options: dict
-    ) -> tuple[int, int]:
-        """Reconstruct a file, write its results and last their record; return columns and rows."""
-        import torch
-
-        from kornia_tidy.cli.commands.system_options import CLOSED_FORM
-        from kornia_tidy.figures.reconstruction_files import reconstruction_in_words, write_reconstruction
-        from kornia_tidy.files import write_bytes
+    def _read(self, path: str) -> CaptureLight:
+        """Return the linear light of a capture."""
         from kornia_tidy.lab.capture_file import PICTURES, read_light
-        from kornia_tidy.reconstruction.light_head import reconstruct_light, with_noise_of
 
         sensor, calibration = read_noise(self.noise)
-        balance = white_balance(self.white_balance)
         is_picture = self.dump.size is None and Path(path).suffix.lower() in PICTURES
-        raw = None if is_picture else self.dump.open(path)
-        capture = read_light(
-            path, raw=raw, linear=self.linear, white_balance=balance, sensor=sensor, calibration=calibration
+        return read_light(
+            path,
+            raw=None if is_picture else self.dump.open(path),
+            linear=self.linear,
+            white_balance=white_balance(self.white_balance),
+            sensor=sensor,
+            calibration=calibration,
         )
-        del raw  # its counts take memory
-        if self.psfs is not None:
-            _check_measured(path, len(capture.light), capture.noise, system)
-        own = with_noise_of(head, capture.noise)  # no other thread's
-        result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
-        size = write_reconstruction(paths[:-1], result, capture, head, self.depth_unit)
-        words = {"head": self.head or CLOSED_FORM, **reconstruction_in_words(head, self.depth_unit)}
-        words |= {"psfs": f"measured: {self.psfs}"} if self.psfs is not None else {}
-        words |= {"noise": capture.noise.extra_repr()} if capture.noise is not None else {}
-        write_bytes(paths[-1], (json.dumps({**said, "size": size, **words}, indent=1) + "\n").encode())
-        return size
 
     def _made_by(self) -> dict[str, Any]:
         """Return what results depend on beside their file, to recognise them on resuming."""
@@ -223,34 +201,3 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             "white_balance": self.white_balance or None,
             "dump": {name: value or None for name, value in vars(self.dump).items()},
         }
-
-
-def is_finished(paths: list[Path], said: dict[str, Any]) -> bool:
-    """Return whether all results of a file exist, made with the same settings."""
-    from kornia_tidy.files import parse_json
-
-    if not all(path.is_file() for path in paths):
-        return False
-    try:
-        record = parse_json(paths[-1].read_bytes())
-    except ValueError:
-        return False
-    return isinstance(record, dict) and all(record.get(name) == value for name, value in said.items())
-
-
-def _identity(path: str) -> dict[str, Any]:
-    """Return the identity of an input file, to recognise it on resuming."""
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"cannot read {path}: there is no such file")
-    state = Path(path).stat()
-    return {"file": Path(path).name, "bytes": state.st_size, "modified": state.st_mtime_ns}
-
-
-def _check_measured(path: str, colors: int, noise: SensorNoise | None, system: TrainedSystem) -> None:
-    """Raise ``ValueError`` if a capture has other colours than the measured PSFs, or a closed form lacks its noise."""
-    measured = system.optics.psf_model.measured
-    assert measured is not None
-    if colors != (channels := measured.psfs.shape[1]):
-        raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
-    if noise is None and not system.step:
-        raise ValueError(f"the noise of {path} is not known: give --noise")

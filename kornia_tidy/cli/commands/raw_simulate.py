@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from kornia_tidy.choices import Compositing, Preset
 from kornia_tidy.cli.commands.raw_options import Pattern, Size
-from kornia_tidy.cli.commands.shared import CameraSettings, DepthFile, File, Noise, check_outputs, read_noise
-from kornia_tidy.settings import Count, Electrons, Metres, Seed, Unit, one_of
+from kornia_tidy.cli.commands.shared import CameraSettings, DepthFile, File, SensorInElectrons, check_outputs
+from kornia_tidy.settings import Count, Metres, Seed, Unit, one_of
 
 if TYPE_CHECKING:
     import torch
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from kornia_tidy.lab.raw.capture import RawCapture
     from kornia_tidy.sensor.noise import SensorNoise
 
-FULL_WELL, READ_NOISE = 10500.0, 2.4  # electrons: a small industrial sensor of 3.45 um pixels
+USUAL = {"full_well": 10500.0, "read_noise": 2.4}  # electrons: a small industrial sensor of 3.45 um pixels
 PATTERN, BITS = "RGGB", 12
 WIDTH, HEIGHT = 640, 480  # of a sheet
 BRIGHTEST = 0.8  # of full scale, of points of light: as a laboratory exposes them
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorOptions:
+class SensorOptions(SensorInElectrons):
     """Sensor.
 
     That of a raw file, or one given in words.
@@ -38,10 +38,6 @@ class SensorOptions:
         white: saturation count, replaces that of the file of like. None: as the file of like says, or by bits.
         color: camera: the picture's colours are seen through the camera's filters, by its matrix and white balance;
             channels: red, green and blue are the camera's own. None: camera with like, else channels.
-        full_well: electrons from black to white. None: 10500.
-        read_noise: its standard deviation. None: 2.4.
-        noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
-            calibrate-noise wrote. None: by full_well and read_noise.
         seed: of the noise.
     """
 
@@ -51,9 +47,6 @@ class SensorOptions:
     black: Annotated[int, Unit("N", "counts", 0)] | None = None
     white: Annotated[float, Unit("N", "counts")] | None = None
     color: Annotated[str, one_of(("camera", "channels"))] | None = None
-    full_well: Electrons | None = None
-    read_noise: Electrons | None = None
-    noise: Noise | None = None
     seed: Seed = 0
 
 
@@ -138,7 +131,9 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
         generator = torch.Generator().manual_seed(self.sensor.seed)
         with stages("read"):
             camera = self._camera()
-            noise = self._noise(camera)
+            noise, calibration = self.sensor.noise_of(16, **USUAL)
+            if calibration is not None and self.sensor.like is not None:
+                calibration.check_taken_alike(camera, self.sensor.like)
         with torch.no_grad():
             if self.image is not None:
                 raw = self._scene(camera, noise, generator, stages)
@@ -163,16 +158,17 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
         assert self.depth is not None
         with stages("read"):
             scene = self.file.read(self.image, self.depth)
-        image = _channels_for(camera, scene.image)
         tell("scene", scene_in_words(scene))
         with stages("PSFs"):
             optics = self.optics.optics(scene, sensor=None, fidelity=self.fidelity, compositing=self.compositing)
-            bank = optics.psf_bank(channels=image.shape[0])
+            bank = optics.psf_bank(channels=3 if camera.colors else 1)
         tell("lens", optics.camera.extra_repr())
         tell("masks", self.optics.in_words(optics))
         tell("PSFs", light_in_words(bank, optics))
         with stages("capture"):
-            raw = simulate_scene(image, scene.depth, optics, camera, noise, color=self._color(), generator=generator)
+            raw = simulate_scene(
+                scene.image, scene.depth, optics, camera, noise, color=self._color(), generator=generator
+            )
         tell("clamped", clamped_in_words(optics, scene.depth))
         return raw
 
@@ -199,10 +195,8 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
 
     def _camera(self) -> RawCapture:
         """Return the sensor of a raw file or of the settings."""
-        import torch
-
         from kornia_tidy.lab.raw.capture import RawCapture
-        from kornia_tidy.lab.raw.color import srgb_from_xyz
+        from kornia_tidy.lab.raw.simulation import simulated_sensor
 
         if self.sensor.like is not None:
             for name in ("pattern", "bits", "black"):
@@ -211,28 +205,7 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
             return RawCapture.open(self.sensor.like, white=self.sensor.white)
         if self.sensor.white is not None:
             raise ValueError("--white is of the file of --like: give that, or --bits")
-        bits = self.sensor.bits or BITS
-        black = 2**bits // 16 if self.sensor.black is None else self.sensor.black
-        camera = RawCapture.from_counts(torch.zeros(1, 2, 2), self.sensor.pattern or PATTERN, black, 2**bits - 1)
-        if set(camera.colors) != set("RGB"):
-            return camera
-        # The camera's colours are declared to be those of the picture, so that a raw developer reproduces them.
-        return replace(camera, xyz_to_camera=srgb_from_xyz().float(), white_balance=torch.ones(len(camera.colors)))
-
-    def _noise(self, camera: RawCapture) -> SensorNoise:
-        from kornia_tidy.sensor.noise import SensorNoise
-
-        if self.sensor.noise is None:
-            full_well = FULL_WELL if self.sensor.full_well is None else self.sensor.full_well
-            read = READ_NOISE if self.sensor.read_noise is None else self.sensor.read_noise
-            return SensorNoise.physical(full_well, read, bits=16)
-        if self.sensor.full_well is not None or self.sensor.read_noise is not None:
-            raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
-        sensor, calibration = read_noise(self.sensor.noise)
-        assert sensor is not None
-        if calibration is not None and self.sensor.like is not None:
-            calibration.check_taken_alike(camera, self.sensor.like)
-        return sensor
+        return simulated_sensor(self.sensor.pattern or PATTERN, self.sensor.bits or BITS, self.sensor.black)
 
     def _check(self, output: Path) -> None:
         """Check before any work that the output can be written, and that the settings are of one target."""
@@ -246,10 +219,3 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
                 raise ValueError(f"--{target} and {option} go together, got only one of them")
         if self.image is not None and self.size is not None:
             raise ValueError("--size is of --flat and --points: a picture has its own")
-
-
-def _channels_for(camera: RawCapture, image: Any) -> Any:
-    """Expand a grey picture to three channels for a colour camera."""
-    if not camera.colors and image.shape[0] == 3:
-        raise ValueError("a monochrome camera needs a grey picture: --image has colours")
-    return image.expand(3, -1, -1) if camera.colors and image.shape[0] == 1 else image

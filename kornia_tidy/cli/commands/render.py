@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -24,8 +23,6 @@ OF_CAMERA = (
 )  # fmt: skip
 OF_MEASURED = ("full_well", "bits")  # known of a camera if its noise was measured
 OF_PRESET = ("noise", "fidelity", "compositing", "border")  # options that replace a part of a published system
-
-PLACES = (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS"))  # in the environment, by torchrun and by srun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +123,7 @@ In Python, in a data loader:
         --shard-megabytes 500 -o captures
 
   Two machines with 16 processes each:
-    torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy.cli render ... -o captures
+    torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy render ... -o captures
 
   The same by SLURM:
     srun --nodes 2 --ntasks-per-node 16 kornia-tidy render ... -o captures
@@ -140,10 +137,14 @@ In Python, in a data loader:
         """Render the data set, and print a summary."""
         from kornia_tidy.cli.commands.report import progress_bar, tell
         from kornia_tidy.training.coded_datasets.layout import Layout
-        from kornia_tidy.training.coded_datasets.render_scenes import render_scenes, shard_items_within
+        from kornia_tidy.training.coded_datasets.render_scenes import (
+            place_among_processes,
+            render_scenes,
+            shard_items_within,
+        )
         from kornia_tidy.training.data_sets import make_scenes
 
-        rank, world = _place()
+        rank, world = place_among_processes()
         optics, settings, camera_from = self._camera()
         scenes = make_scenes(settings, self.split, self.scenes)
         layout = Layout(self.files.beside, self.files.float32, self.files.shard_items)
@@ -217,20 +218,3 @@ In Python, in a data loader:
         optics = TiDyOptics.from_preset(self.preset, generator=noise, **overrides)
         seen = settings.replace(depth_range=getattr(optics.camera, "depth_range", None))
         return optics, seen, {"preset": self.preset, "options": {name: given[name] for name in own}}
-
-
-def _place() -> tuple[int, int]:
-    """Return the number of this process among those that share the work, and their number."""
-    for rank, world in PLACES:
-        if rank in os.environ:
-            place = _whole(rank), _whole(world) if world in os.environ else 1
-            if place[0] >= place[1]:
-                raise ValueError(f"{rank} in the environment must be below {world}, {place[1]}, got {place[0]}")
-            return place
-    return 0, 1
-
-
-def _whole(name: str) -> int:
-    if not os.environ[name].isdecimal():
-        raise ValueError(f"{name} in the environment must be a whole number, got {os.environ[name]!r}")
-    return int(os.environ[name])

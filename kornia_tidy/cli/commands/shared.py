@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from kornia_tidy.reconstruction.settings import LensSettings
-from kornia_tidy.settings import Metres, Seed, Unit, one_of
+from kornia_tidy.settings import Electrons, Metres, Seed, Unit, one_of
 
 if TYPE_CHECKING:
     from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -97,6 +97,46 @@ class OwnScene:
     def read(self) -> Scene | None:
         """Read the scene, if there is one."""
         return None if self.image is None or self.depth is None else self.file.read(self.image, self.depth)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorInElectrons:
+    """Noise of the sensor.
+
+    Args:
+        full_well: electrons from black to white. None: as noise says, or, to simulate, 10500.
+        read_noise: its standard deviation. None: as noise says, or, to simulate, 2.4.
+        noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
+            calibrate-noise wrote. None: by full_well and read_noise.
+    """
+
+    full_well: Electrons | None = None
+    read_noise: Electrons | None = None
+    noise: Noise | None = None
+
+    def noise_of(self, bits: int = 12, **usual: float) -> tuple[SensorNoise, PhotonTransfer | None]:
+        """Return the sensor, and its calibration if it was measured.
+
+        Args:
+            bits: of its converter.
+            usual: ``full_well`` and ``read_noise`` where they are not given.
+
+        Raises:
+            ValueError: if the noise is given twice, or not at all.
+        """
+        from kornia_tidy.sensor.noise import SensorNoise
+
+        given = {name: value for name in ("full_well", "read_noise") if (value := getattr(self, name)) is not None}
+        if self.noise is not None:
+            if given:
+                raise ValueError("--noise says full well and read noise: leave out --full-well and --read-noise")
+            sensor, calibration = read_noise(self.noise)
+            assert sensor is not None
+            return sensor, calibration
+        given = {**usual, **given}
+        if len(given) < 2:
+            raise ValueError("the noise of the sensor is needed: --noise, or --full-well and --read-noise")
+        return SensorNoise.physical(given["full_well"], given["read_noise"], bits=bits), None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,22 +109,17 @@ class Systems:
     def _scene(self) -> tuple[Tensor, Tensor, str]:
         """Return an RGB image, its normalised inverse depth in [0, 1], and its name."""
         import torch
-        from kornia.geometry.transform import resize
 
         from kornia_tidy.data.dead_leaves import dead_leaves
         from kornia_tidy.data.depth_range import middle_depths
+        from kornia_tidy.data.rgbd import Scene
 
-        scene = self.scene.read()
-        if scene is None:
+        if (scene := self.scene.read()) is None:
             height, width = round(self.size * 0.625), self.size
             image, depth = dead_leaves(height, width, depth_range=(0.5, 5.0), seed=self.seed)
-            valid, name = torch.ones_like(depth, dtype=torch.bool), "dead leaves"
+            scene, name = Scene(image, depth, torch.ones_like(depth, dtype=torch.bool)), "dead leaves"
         else:
-            (image, depth, valid), name = scene, Path(str(self.scene.image)).name
-        near, far = (1 / end for end in middle_depths(depth, valid))
-        inverse_depth = ((1 / depth - far) / (near - far)).clamp(0, 1)
-        image = image.expand(3, -1, -1)
-        if max(image.shape[-2:]) > self.size:
-            image = resize(image[None], self.size, side="long", antialias=True)[0].clamp(0, 1)
-            inverse_depth = resize(inverse_depth[None], self.size, side="long", interpolation="nearest")[0]
-        return image, inverse_depth, name
+            name = Path(str(self.scene.image)).name
+        near, far = (1 / end for end in middle_depths(scene.depth, scene.valid))
+        image, depth, _ = scene.within(self.size)
+        return image, ((1 / depth - far) / (near - far)).clamp(0, 1), name

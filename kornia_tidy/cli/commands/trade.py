@@ -11,12 +11,7 @@ from kornia_tidy.cli.commands.shared import CameraSettings, Folder, OwnScene, ch
 from kornia_tidy.settings import Count, Pixels, Seed, Unit, one_of
 
 if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
-    from kornia_tidy.camera.tidy_optics import TiDyOptics
     from kornia_tidy.data.rgbd import Scene
-    from kornia_tidy.design.tradeoff.sweep_settings import Setting
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
 
@@ -88,20 +83,21 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         folder = check_folder(self.output)
         from kornia_tidy.cli.commands.report import progress_bar, scene_in_words, tell
         from kornia_tidy.design.tradeoff.conditions import Conditions
+        from kornia_tidy.design.tradeoff.costs import checked_device
         from kornia_tidy.design.tradeoff.files import TradeRun, known_rows, markdown, rows_beside, write_trade
-        from kornia_tidy.design.tradeoff.measure import missing, sweep
+        from kornia_tidy.design.tradeoff.measure import missing, scene_settings, sweep
         from kornia_tidy.figures.style import require_matplotlib, save_figure
         from kornia_tidy.figures.tradeoff import draw_trade
 
         require_matplotlib()
-        device = self._device()
+        device = checked_device(self.device)
         scene = self._scene()
         optics = self.camera.optics(scene).to(device)
         image, depth = scene.image.to(device), scene.depth.to(device)
         optics.check_scene(image, depth)  # warns once: the measured captures do not warn
         name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
         conditions = Conditions.here_and_now(name, optics, image, depth, self.reference)
-        settings = self._settings(optics, image, depth)
+        settings = scene_settings(optics, image, depth, self.base, self.knobs or KNOBS)
         known, why = known_rows(folder, conditions)
 
         tell("scene", f"{name}, {scene_in_words(scene)}")
@@ -147,21 +143,6 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         for other in ("trade.json", "trade.csv"):
             tell("", str(folder / other))
 
-    def _device(self) -> torch.device:
-        """Return the device, or raise an error before any work."""
-        import torch
-
-        from kornia_tidy.checks import check_choice
-        from kornia_tidy.design.tradeoff.costs import DEVICES
-
-        check_choice("--device", self.device.partition(":")[0], DEVICES)
-        if self.device.startswith("cuda") and not torch.cuda.is_available():
-            raise ValueError(f"--device {self.device}: PyTorch finds no CUDA GPU here")
-        try:
-            return torch.device(self.device)
-        except RuntimeError:
-            raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
-
     def _scene(self) -> Scene:
         import torch
 
@@ -172,17 +153,3 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
             return scene
         image, depth = dead_leaves(self.size, self.size, depth_range=(NEAR, FAR), seed=self.seed)
         return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
-
-    def _settings(self, optics: TiDyOptics, image: Tensor, depth: Tensor) -> list[Setting]:
-        """Return the points of the sweep and the plans, without windows wider than the border allows."""
-        from kornia_tidy.design.tradeoff.measure import linear_light
-        from kornia_tidy.design.tradeoff.sweep_settings import PLAN, planned, sweep_settings
-        from kornia_tidy.render.borders import largest_window
-
-        knobs = self.knobs or KNOBS
-        widest = largest_window(optics.border, *image.shape[-2:])
-        steps = sweep_settings(self.base, [knob for knob in knobs if knob != PLAN])
-        settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
-        if PLAN in knobs:
-            settings += planned(optics, linear_light(optics, image)[None], depth[None])
-        return settings

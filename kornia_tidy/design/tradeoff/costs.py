@@ -29,6 +29,25 @@ class Timing(NamedTuple):
     spread: float
 
 
+def checked_device(name: str) -> torch.device:
+    """Return the device to measure on, before any work.
+
+    Raises:
+        ValueError: if it is neither a processor nor a CUDA GPU that PyTorch finds.
+
+    Example:
+        >>> checked_device("cpu")
+        device(type='cpu')
+    """
+    check_choice("device", name.partition(":")[0], DEVICES)
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"device {name}: PyTorch finds no CUDA GPU here")
+    try:
+        return torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"device must be cpu, cuda or cuda:N, got {name!r}") from None
+
+
 def seconds(action: Callable[[], Any], repeats: int, device: torch.device) -> Timing:
     """Time an action after one warm-up run, with the device synchronised before the clock is read.
 

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.choices import KNOBS
 from kornia_tidy.design.tradeoff.costs import peak_bytes, seconds
-from kornia_tidy.design.tradeoff.sweep_settings import PRESET, Setting, Value
+from kornia_tidy.design.tradeoff.sweep_settings import PLAN, PRESET, Setting, Value, planned, sweep_settings
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.render.borders import largest_window
 
@@ -59,6 +60,34 @@ class TradeRow:
     capture_bytes: int
     training_bytes: int | None
     repeats: int
+
+
+def scene_settings(
+    optics: TiDyOptics, image: Tensor, depth: Tensor, base: str | Fidelity = "balanced", knobs: Iterable[str] = KNOBS
+) -> list[Setting]:
+    """Return the points of a sweep for a scene, without windows wider than its border allows, and the plans for it.
+
+    Args:
+        optics: the camera.
+        image: (C, H, W), in the colour space of the camera.
+        depth: (1, H, W), metres.
+        base: preset or fidelity whose settings are varied, each alone.
+        knobs: names of settings; ``"preset"`` for the presets, ``"plan"`` for the plans.
+
+    Raises:
+        ValueError: if a name is not known.
+
+    Example:
+        >>> from kornia_tidy import PixelwiseMask
+        >>> optics = TiDyOptics(PixelwiseMask(1, initial="flat"))
+        >>> image, depth = torch.rand(3, 32, 32), torch.full((1, 32, 32), 0.9)
+        >>> [step.value for step in scene_settings(optics, image, depth, knobs=["window"])]
+        [9, 17, 33, None]
+    """
+    widest, knobs = largest_window(optics.border, *image.shape[-2:]), tuple(knobs)
+    steps = sweep_settings(base, [knob for knob in knobs if knob != PLAN])
+    settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
+    return settings + (planned(optics, linear_light(optics, image)[None], depth[None]) if PLAN in knobs else [])
 
 
 def sweep(

@@ -1,4 +1,4 @@
-"""Properties of a raw capture, in words and as plain values."""
+"""Properties of a raw capture and of its picture, in words and as plain values."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 from torch import Tensor
 
 from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
+from kornia_tidy.lab.raw.color import ASSUMED_CAMERA
+from kornia_tidy.lab.raw.develop import balance_factors, default_method, matrix_origin
 
 FLIPS = {
     0: "is upright",
@@ -99,6 +101,33 @@ def raw_properties(raw: RawCapture) -> dict[str, Any]:
         "flip": raw.flip,
         "pixel_aspect": raw.pixel_aspect,
     }
+
+
+def colors_in_words(raw: RawCapture, demosaic: str | None, balance: str | Tensor | None) -> str:
+    """Describe the colour matrix and the white balance of a picture."""
+    if not raw.colors:
+        return "monochrome"
+    factors = balance_factors(raw, balance)
+    shown = " ".join(f"{name} {factor:.4g}" for name, factor in zip(raw.colors, factors.tolist(), strict=True))
+    method = "no filter array" if raw.pattern is None else demosaic or default_method(raw)
+    matrix = {
+        "file": "the file's matrix",
+        "model": "LibRaw's matrix of the camera",
+        "assumed": f"no matrix: that of {ASSUMED_CAMERA} is assumed",
+    }[matrix_origin(raw)]
+    return f"{method}, white balance {shown}, {matrix}"
+
+
+def clipped_in_words(image: Tensor) -> str:
+    """Describe the share of a linear picture that a file of [0, 1] clips.
+
+    Example:
+        >>> import torch
+        >>> clipped_in_words(torch.tensor([[[-0.1, 0.5, 1.0, 1.2]]]))
+        '25 % of its values lie above white and 25 % below black, and are clipped'
+    """
+    above, below = (100 * float(share.float().mean()) for share in (image > 1, image < 0))
+    return f"{above:.3g} % of its values lie above white and {below:.3g} % below black, and are clipped"
 
 
 def _exposure(info: RawInfo) -> str:

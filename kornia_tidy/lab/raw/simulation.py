@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
 from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.color import camera_to_srgb
+from kornia_tidy.lab.raw.color import camera_to_srgb, srgb_from_xyz
 from kornia_tidy.lab.raw.filter_array import tiled
 from kornia_tidy.sensor.noise import SensorNoise
 
@@ -56,6 +56,31 @@ def simulate_raw(
     return replace(camera, counts=counts, flip=0, info=replace(camera.info, timestamp=None))
 
 
+def simulated_sensor(pattern: str = "RGGB", bits: int = 12, black: float | None = None) -> RawCapture:
+    """Return a sensor that is described in words, as the ``camera`` of a simulation.
+
+    Its colours are declared to be those of the picture, so that a raw developer reproduces them.
+
+    Args:
+        pattern: colours of the filter array's tile, by rows.
+        bits: of the converter, whose white is 2^bits - 1.
+        black: count without light. Default: 2^bits / 16.
+
+    Raises:
+        ValueError: if there is no such filter array, or black is not below white.
+
+    Example:
+        >>> sensor = simulated_sensor("GBRG", bits=14)
+        >>> sensor.white, sensor.colors
+        (16383.0, 'RGBG')
+    """
+    dark = 2**bits // 16 if black is None else black
+    camera = RawCapture.from_counts(torch.zeros(1, 2, 2), pattern, dark, 2**bits - 1)
+    if set(camera.colors) != set("RGB"):
+        return camera
+    return replace(camera, xyz_to_camera=srgb_from_xyz().float(), white_balance=torch.ones(len(camera.colors)))
+
+
 def simulate_scene(
     image: Tensor,
     depth: Tensor,
@@ -69,7 +94,7 @@ def simulate_scene(
     """Simulate the raw capture of a scene with depth through given optics.
 
     Args:
-        image: (3, H, W) or (1, H, W), in the color space of the optics.
+        image: (3, H, W) or (1, H, W), in the color space of the optics; a colour camera sees grey as three channels.
         depth: (1, H, W), metres.
         optics: a :class:`~kornia_tidy.camera.tidy_optics.TiDyOptics` with ``sensor=None``, as the camera is the sensor.
         camera: as for :func:`simulate_raw`.
@@ -91,6 +116,9 @@ def simulate_scene(
     lens: Any = optics
     if lens.sensor is not None:
         raise ValueError("optics must have sensor=None, as the noise is the camera's: TiDyOptics(..., sensor=None)")
+    if not camera.colors and image.shape[0] == 3:
+        raise ValueError("a monochrome camera needs a grey picture, of one channel")
+    image = image.expand(3, -1, -1) if camera.colors and image.shape[0] == 1 else image
     with torch.no_grad():
         light = lens.decode(lens(image, depth)[None])[0]
     return simulate_raw(light, camera, noise, color=color, generator=generator)

@@ -37,6 +37,8 @@ Files = dict[str, bytes]
 Capture = tuple[str, Files]  # key and files of an item
 Each = Callable[[int, int], None]
 
+PLACES = (("RANK", "WORLD_SIZE"), ("SLURM_PROCID", "SLURM_NTASKS"))  # in the environment, by torchrun and by srun
+
 
 class Rendered(NamedTuple):
     """Numbers of captures of one process."""
@@ -45,6 +47,29 @@ class Rendered(NamedTuple):
     """Items photographed in this call."""
     found: int
     """Items that existed before."""
+
+
+def place_among_processes() -> tuple[int, int]:
+    """Return the number of this process among those that share the work, and their number.
+
+    They are ``RANK`` and ``WORLD_SIZE`` in the environment, from torchrun, or those of srun; 0 and 1 without either.
+
+    Raises:
+        ValueError: if they are not whole numbers, the first below the second.
+    """
+    for rank, world in PLACES:
+        if rank in os.environ:
+            place = _whole(rank), _whole(world) if world in os.environ else 1
+            if place[0] >= place[1]:
+                raise ValueError(f"{rank} in the environment must be below {world}, {place[1]}, got {place[0]}")
+            return place
+    return 0, 1
+
+
+def _whole(name: str) -> int:
+    if not os.environ[name].isdecimal():
+        raise ValueError(f"{name} in the environment must be a whole number, got {os.environ[name]!r}")
+    return int(os.environ[name])
 
 
 def render_scenes(

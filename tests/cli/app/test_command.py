@@ -9,7 +9,7 @@ import pytest
 from kornia_tidy.cli.command_line import main, read_command
 from tests.base import BaseTester
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 class TestCommand(BaseTester):

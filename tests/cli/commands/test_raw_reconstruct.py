@@ -309,7 +309,7 @@ class TestRawReconstruct(BaseTester):
         for i, path in enumerate(files):
             path.write_bytes(raw_file((300, 400), i))
         folder = tmp_path / "out"
-        command = [sys.executable, "-m", "kornia_tidy.cli", "raw", "reconstruct", *map(str, files), "--head"]
+        command = [sys.executable, "-m", "kornia_tidy", "raw", "reconstruct", *map(str, files), "--head"]
         command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder), "--jobs", "2"]
         before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
         process = subprocess.Popen(

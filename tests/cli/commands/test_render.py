@@ -18,7 +18,7 @@ from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester
 from tests.training.coded_datasets.samples import contents
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SMALL = ["--size", "40", "--scenes", "3", "--fidelity", "draft", "--border", "replicate", "--depth-range", "0.4", "4"]
 
 
@@ -71,7 +71,7 @@ class TestRender(BaseTester):
 
     @pytest.mark.slow
     def test_feature_torchrun_shares_the_work(self, rendered, tmp_path):
-        torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "kornia_tidy.cli"]
+        torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "kornia_tidy"]
         command = [sys.executable, "-m", *torchrun, "render", *SMALL, "--masks", "2", "--shard-items", "2"]
         done = subprocess.run([*command, "-o", str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 0, done.stderr

@@ -113,8 +113,8 @@ class TestTrade(BaseTester):
         ("arguments", "sentence"),
         [
             (["--image", "a.png"], "--image and --depth belong together"),
-            (["--device", "tpu"], "--device must be one of 'cpu', 'cuda', got 'tpu'"),
-            (["--device", "cpu:x"], "--device must be cpu, cuda or cuda:N, got 'cpu:x'"),
+            (["--device", "tpu"], "device must be one of 'cpu', 'cuda', got 'tpu'"),
+            (["--device", "cpu:x"], "device must be cpu, cuda or cuda:N, got 'cpu:x'"),
         ],
     )
     def test_exception_is_one_sentence_before_any_work(self, arguments, sentence, tmp_path, monkeypatch, capsys):

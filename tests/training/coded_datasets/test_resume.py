@@ -11,7 +11,7 @@ from tests.base import BaseTester
 from tests.training.coded_datasets.killed_renders import COUNT, FORMS
 from tests.training.coded_datasets.samples import contents
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")

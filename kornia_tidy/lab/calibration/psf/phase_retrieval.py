@@ -113,6 +113,21 @@ def fit_masks(measured: PSFBank, lens: PSFModel, iterations: int = 150, channel:
     return model.fit()
 
 
+def spectrum_of(channels: int) -> Spectrum:
+    """Return the wavelengths of measured PSFs by their number of channels: 530 nm, or red, green and blue.
+
+    Raises:
+        ValueError: if there are other than 1 or 3.
+
+    Example:
+        >>> spectrum_of(1).wavelengths
+        (5.3e-07,)
+    """
+    if channels not in {1, 3}:
+        raise ValueError(f"a mask is found by PSFs of 1 or 3 channels, these have {channels}")
+    return Spectrum.monochrome() if channels == 1 else Spectrum.rgb()
+
+
 def retrieve_mask(
     measured: PSFBank,
     camera: ThinLensCamera | DefocusRange,

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from kornia_tidy.cli.commands.file_jobs import Row, table, work_on_all
+from kornia_tidy.lab.file_jobs import Row, table, work_on_all
 from tests.base import BaseTester
 
 

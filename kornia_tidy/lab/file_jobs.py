@@ -1,11 +1,12 @@
-"""Work on several files at a time, with a progress bar, and its summary."""
+"""Work on several files at a time, with a progress bar, its summary, and where the results go."""
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,30 @@ class Row(NamedTuple):
     result: str
     size: str = ""
     seconds: float | None = None
+
+
+def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
+    """Apply an action to every file, and go on after errors.
+
+    Args:
+        paths: of the files.
+        work: the action.
+
+    Raises:
+        OSError, ValueError: the error of a single file; for several files the number that failed, after their errors
+            have been printed.
+    """
+    failed = 0
+    for path in paths:
+        try:
+            work(path)
+        except (OSError, ValueError) as error:
+            if len(paths) == 1:
+                raise
+            failed += 1
+            _print_error(error)
+    if failed:
+        raise ValueError(f"{failed} of {len(paths)} files failed")
 
 
 def work_on_all(
@@ -78,6 +103,36 @@ def work_on_all(
     return [rows[path] for path in paths]
 
 
+def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
+    """Return the output paths of each file.
+
+    Args:
+        files: inputs; one that is named twice counts once.
+        folder: of the outputs.
+        suffixes: that take the place of a file's own, one for each of its outputs.
+
+    Raises:
+        ValueError: if two files would become the same picture, or a picture would replace one of the files.
+
+    Example:
+        >>> output_paths(["shots/a.dng"], Path("sharp"), [".png", ".json"])
+        {'shots/a.dng': [PosixPath('sharp/a.png'), PosixPath('sharp/a.json')]}
+    """
+    outputs: dict[str, list[Path]] = {}
+    owners: dict[str, str] = {}
+    for path in dict.fromkeys(files):
+        stem = Path(path).stem
+        if stem in owners:
+            raise ValueError(f"{owners[stem]} and {path} would both become {folder / stem}{suffixes[0]}")
+        owners[stem] = path
+        outputs[path] = [folder / f"{stem}{suffix}" for suffix in suffixes]
+    taken = {Path(path).resolve() for path in files}
+    for output in (output for each in outputs.values() for output in each):
+        if output.resolve() in taken:
+            raise ValueError(f"cannot write {output}: it is an input")
+    return outputs
+
+
 def table(rows: list[Row]) -> list[str]:
     """Return the summary with one line per file.
 
@@ -101,10 +156,15 @@ def _row(path: str, future: Future[Row]) -> Row:
     try:
         return future.result()
     except Exception as error:
-        sentence = " ".join(str(error).split()) or type(error).__name__
-        with tqdm.external_write_mode(file=sys.stderr):
-            print(f"kornia-tidy: error: {sentence}", file=sys.stderr, flush=True)
-        return Row(path, sentence)
+        return Row(path, _print_error(error))
+
+
+def _print_error(error: Exception) -> str:
+    """Print an error as one sentence, and return the sentence."""
+    sentence = " ".join(str(error).split()) or type(error).__name__
+    tqdm.write(f"kornia-tidy: error: {sentence}", file=sys.stderr)
+    sys.stderr.flush()
+    return sentence
 
 
 def _share_cores(jobs: int) -> None:
