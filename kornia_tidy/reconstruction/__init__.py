@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from kornia_tidy.lazy import importer
 
 if TYPE_CHECKING:
+    from kornia_tidy.reconstruction.any_camera import AnyCameraHead
     from kornia_tidy.reconstruction.attention_unet import AttentionUNet
     from kornia_tidy.reconstruction.closed_form import ClosedForm, Restoration, closed_form_channels
     from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
@@ -26,12 +27,14 @@ if TYPE_CHECKING:
     from kornia_tidy.reconstruction.refocused import Refocused
     from kornia_tidy.reconstruction.residual import Residual
     from kornia_tidy.reconstruction.restored_over_field import restored_over_field
+    from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
     from kornia_tidy.reconstruction.self_ensemble import SelfEnsemble, self_ensemble
     from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
     from kornia_tidy.reconstruction.tiled import reconstruct_tiled
     from kornia_tidy.reconstruction.wiener import Wiener
 
 __all__ = [
+    "AnyCameraHead",
     "AttentionUNet",
     "ClosedForm",
     "ClosedFormHead",
@@ -47,6 +50,7 @@ __all__ = [
     "Refocused",
     "Residual",
     "Restoration",
+    "RuledClosedForm",
     "SelfEnsemble",
     "Tikhonov",
     "TikhonovLayers",
@@ -63,6 +67,7 @@ __all__ = [
 __getattr__ = importer(
     __name__,
     {
+        "any_camera": ("AnyCameraHead",),
         "attention_unet": ("AttentionUNet",),
         "closed_form": (
             "ClosedForm",
@@ -88,6 +93,7 @@ __getattr__ = importer(
         "refocused": ("Refocused",),
         "residual": ("Residual",),
         "restored_over_field": ("restored_over_field",),
+        "ruled_closed_form": ("RuledClosedForm",),
         "self_ensemble": (
             "SelfEnsemble",
             "self_ensemble",

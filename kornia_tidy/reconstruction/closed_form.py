@@ -150,6 +150,7 @@ class ClosedForm(nn.Module):
         (torch.Size([2, 3, 16, 20]), torch.Size([2, 19, 16, 20]))
     """
 
+    even_noise = False  # True if the noise of a pixel counts by its mean over the picture
     psfs: Tensor
     veil: Tensor
     kernels: Tensor
@@ -176,6 +177,7 @@ class ClosedForm(nn.Module):
         self.inverse, self.fine = inverse, fine
         self.layers, self.bilateral, self.encoded, self.likelihood = layers, bilateral, encoded, likelihood
         self.mean_light: Tensor | None = None
+        self.detail: Tensor | None = None  # of the whole picture, as is the mean light
         self.has_stray_light = False
         self.register_buffer("psfs", torch.zeros(layers or (NODES if inverse == "wiener" else 1), 3, 0, 0))
         self.register_buffer("veil", torch.zeros(3))  # share of stray light, mean over depth
@@ -283,30 +285,29 @@ class ClosedForm(nn.Module):
         precise = torch.promote_types(layers.dtype, self.kernels.dtype)
         with torch.autocast(layers.device.type, enabled=False):
             image = self._encode((shares.to(precise).unsqueeze(2) * layers.to(precise)).sum(1))
-            return self._smooth(image, _above(noise.to(precise))).to(layers.dtype)
+            return self._smooth(image, self._color(noise.to(precise), image)).to(layers.dtype)
 
     def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
         light = self._without_stray_light(self._light(capture))
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
-        above = _above(noise)
         brightness = light.mean(1, keepdim=True)
         by_depth, deconvolved = [], light.new_zeros(len(light), 0, *light.shape[1:])
         if self.likelihood:
             fits = depth_likelihood(brightness, self.whitening.to(light.dtype), self.log_determinants.to(light.dtype))
             deconvolved = convolve_kernels(light, self.filters.to(light.dtype))
-            shares = (fits / (BLEND_SHARPNESS * 10**above)).softmax(1)
+            shares = (fits / (BLEND_SHARPNESS * 10 ** _above(noise))).softmax(1)
             image = self._encode((shares.unsqueeze(2) * deconvolved).sum(1))
             by_depth = [self._brightness(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
         else:
-            image = self._encode(_interpolated(estimates, self._place(level)))
+            image = self._encode(_interpolated(estimates, self._place(level, light)))
             if self.layers:
                 by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
-        image = self._smooth(image, above)
+        image = self._smooth(image, self._color(noise, light))
         maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
         return Restoration(image, torch.cat(maps, 1), deconvolved)
 
-    def _place(self, level: Tensor) -> Tensor:
+    def _place(self, level: Tensor, light: Tensor) -> Tensor:
         """Return which of the estimates is best for the noise, given as its logarithm; between two a fraction."""
         above = level - math.log10(NOISE)
         if self.inverse == "tikhonov":
@@ -317,10 +318,12 @@ class ClosedForm(nn.Module):
             taken = level + math.log10(WIENER_FACTOR) / 2
         return (taken - math.log10(WIENER_NOISES[0])) / STEP
 
-    def _smooth(self, image: Tensor, above: Tensor) -> Tensor:
-        if not self.bilateral:
-            return image
-        return bilateral_filter(image, COLOR * 10 ** (COLOR_EXPONENT * above), WINDOW, SPACE)
+    def _smooth(self, image: Tensor, color: Tensor) -> Tensor:
+        return bilateral_filter(image, color, WINDOW, SPACE) if self.bilateral else image
+
+    def _color(self, noise: Tensor, light: Tensor) -> Tensor:
+        """Return the width of the bilateral filter in colour."""
+        return COLOR * 10 ** (COLOR_EXPONENT * _above(noise))
 
     def _brightness(self, light: Tensor) -> Tensor:
         """Encode one map for each depth, (B, D, H, W)."""
@@ -340,6 +343,17 @@ class ClosedForm(nn.Module):
     def _encode(self, light: Tensor) -> Tensor:
         light = light.clamp(0, 1)
         return linear_rgb_to_rgb(light) if self.encoded else light
+
+
+def light_detail(light: Tensor) -> Tensor:
+    """Return the mean square difference of neighbouring pixels of each picture, (B, C, H, W) to (B,).
+
+    Example:
+        >>> light_detail(torch.tensor([[0.0, 1.0], [0.0, 1.0]]).view(1, 1, 2, 2))
+        tensor([0.5000])
+    """
+    along, down = (light.diff(dim=axis).square().nan_to_num().mean((1, 2, 3)) for axis in (-1, -2))
+    return (along + down).nan_to_num() / 2
 
 
 def _above(noise: Tensor) -> Tensor:

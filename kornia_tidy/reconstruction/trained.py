@@ -147,10 +147,23 @@ def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
         if isinstance(module, Refocused):
             module.set_psfs(_psf_bank(optics, 1, _nodes(optics, module.layers)))
         elif isinstance(module, ClosedForm | LayeredJointHead):
-            bank = _psf_bank(optics, 3, _nodes(optics, module.layers or NODES))
-            module.set_psfs(bank, correlate=optics.fidelity.correlate)
+            module.set_psfs(closed_form_bank(optics, module.layers), correlate=optics.fidelity.correlate)
             if isinstance(module, ClosedForm) and optics.sensor is not None:
                 module.set_noise(optics.sensor)
+
+
+def closed_form_bank(optics: TiDyOptics, layers: int = 0) -> PSFBank:
+    """Return a camera's PSFs as a closed form takes them: of three colours, evenly spaced over the range of defocus.
+
+    Args:
+        optics: the camera.
+        layers: number of depths. 0: as many as PSFs are averaged over.
+
+    Example:
+        >>> closed_form_bank(TiDyOptics(fidelity="draft"), 5).psfs.shape[:2]
+        torch.Size([5, 3])
+    """
+    return _psf_bank(optics, 3, _nodes(optics, layers or NODES))
 
 
 def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:

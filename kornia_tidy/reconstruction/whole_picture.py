@@ -1,4 +1,4 @@
-"""Stray light of a whole picture, told to the closed forms in a network that see parts of it."""
+"""Mean light of a whole picture, told to the closed forms in a network that see parts of it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.closed_form import ClosedForm
+from kornia_tidy.reconstruction.closed_form import ClosedForm, light_detail
 
 
 @contextmanager
@@ -38,23 +38,24 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     if parts:
         strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
         lights = (rgb_to_linear_rgb(strip) if encoded else strip for strip in strips)
-        total = torch.stack([light.sum((-2, -1)) for light in lights]).sum(0)
+        sums = [(light.sum((-2, -1)), light.shape[-2] * light_detail(light)) for light in lights]
+        total, detail = (torch.stack(each).sum(0) for each in zip(*sums, strict=True))
         mean = total[..., None, None] / (picture.shape[-2] * picture.shape[-1])
     try:
         for part in parts:
-            part.mean_light = mean.to(part.psfs)
+            part.mean_light, part.detail = mean.to(part.psfs), (detail / picture.shape[-2]).to(part.psfs)
         yield
     finally:
         for part in parts:
-            part.mean_light = None
+            part.mean_light = part.detail = None
 
 
 def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
-    """Return the closed forms in a network that estimate stray light from the mean light of their own input.
+    """Return the closed forms in a network that estimate stray light or noise from the mean light of their own input.
 
     Example:
         >>> untold_closed_forms(nn.Conv2d(3, 3, 1))
         []
     """
     parts = [module for module in head.modules() if isinstance(module, ClosedForm)]
-    return [part for part in parts if part.has_stray_light and part.mean_light is None]
+    return [part for part in parts if (part.has_stray_light or part.even_noise) and part.mean_light is None]

@@ -129,7 +129,8 @@ class TestClosedForm(BaseTester):
             if not bilateral:
                 self.assert_close(image, expected)
             else:
-                smooth = restore._smooth(expected, torch.full((1, 1, 1, 1), max(0.0, math.log10(noise / 0.002))))
+                color = 0.2 * max(1.0, noise / 0.002) ** 0.5
+                smooth = restore._smooth(expected, torch.full((1, 1, 1, 1), color))
                 self.assert_close(image, smooth, atol=1e-6, rtol=0)
 
     @pytest.mark.parametrize("layers", [0, 3])

@@ -1,0 +1,102 @@
+"""A network for the captures of any camera: it corrects the closed form as far as it is sure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from kornia_tidy.reconstruction.closed_form import closed_form_channels
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.nafnet import NAFNet
+from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, RuledClosedForm
+
+SHARE = 1.0  # logit of the share before training
+
+
+class AnyCameraHead(ClosedFormHead):
+    r"""Adds a share of a network's correction to the closed form, which knows the camera.
+
+    .. math:: \hat x = x_0 + \sigma(s) \, \Delta
+
+    The network estimates the correction :math:`\Delta`, and for each pixel the logit s of its share. It is told what is
+    known of the camera: the maps of :class:`~kornia_tidy.reconstruction.ruled_closed_form.RuledClosedForm`. So one
+    network serves all cameras: PSFs and noise are set, not learnt.
+
+    Args:
+        width: of the :class:`~kornia_tidy.reconstruction.NAFNet`.
+        repeats: of its blocks.
+        layers: number of depths whose deconvolutions the network sees.
+        encoded: captures are encoded as sRGB. False: they are linear light.
+
+    Shape:
+        - image: (B, 3, H, W), captures of the camera, of any size.
+        - noise: as for :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
+        - output: (B, 3, H, W), the image in the colours of the capture.
+
+    Raises:
+        ValueError: if no PSFs were given before the first capture.
+
+    Convention:
+        - PSFs and noise come from the camera by :func:`kornia_tidy.reconstruction.trained.update_psfs`.
+        - Before training :math:`\Delta` is zero.
+
+    Source: He et al., Deep Residual Learning (CVPR 2016); Srivastava, Greff and Schmidhuber, Highway Networks (2015),
+    for a learnt share.
+
+    Example:
+        >>> from kornia_tidy.psf.psf_bank import PSFBank
+        >>> head = AnyCameraHead(width=4, repeats=1).eval()
+        >>> head.closed_form.set_psfs(PSFBank.from_measured(torch.rand(7, 3, 5, 5), torch.arange(7.0)))
+        >>> capture = torch.rand(1, 3, 32, 48)
+        >>> torch.equal(head(capture, 0.01), head.closed_form(capture, 0.01).image)  # before training
+        True
+    """
+
+    def __init__(self, width: int = 16, repeats: int = 3, layers: int = 7, *, encoded: bool = True) -> None:
+        super().__init__(None, encoded=encoded)
+        self.closed_form = RuledClosedForm(layers, encoded=encoded)
+        network = NAFNet(closed_form_channels(layers) + CAMERA_MAPS, 4, width, repeats)
+        nn.init.zeros_(network.last.weight)
+        network.last.bias = nn.Parameter(torch.tensor([SHARE, 0.0, 0.0, 0.0]))
+        network.looked = True  # no check of the range, as maps leave [0, 1]
+        self.network: NAFNet = network
+        self.stride = network.stride
+
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the image from the capture and the map of its noise, (B, 6, H, W)."""
+        restored = self.closed_form(*image.split(3, 1))
+        return corrected(restored.image, self.network(restored.maps))
+
+
+def corrected(image: Tensor, maps: Tensor) -> Tensor:
+    """Return an image plus the share of its correction; maps are the logit of the share and the correction.
+
+    Example:
+        >>> corrected(torch.zeros(1, 3, 1, 1), torch.tensor([0.0, 0.2, 0.4, 0.6]).view(1, 4, 1, 1)).flatten()
+        tensor([0.1000, 0.2000, 0.3000])
+    """
+    return image + maps[:, :1].sigmoid() * maps[:, 1:]
+
+
+def from_one_camera(weights: Mapping[str, Tensor], head: AnyCameraHead) -> dict[str, Tensor]:
+    """Return the weights of a network that was trained with one camera as a start for one of any camera.
+
+    Weights of the maps that tell of the camera are zero, and the share is the same everywhere.
+
+    Args:
+        weights: state of the network of a :class:`~kornia_tidy.reconstruction.ClosedFormHead` with as many layers,
+            blocks and channels, without fine maps.
+        head: it is not changed.
+
+    Returns:
+        A state for ``head.network``.
+    """
+    found = dict(weights)
+    found["first.weight"] = functional.pad(weights["first.weight"], (0, 0, 0, 0, 0, CAMERA_MAPS))
+    last, bias = weights["last.weight"], weights["last.bias"]
+    found["last.weight"] = torch.cat([torch.zeros_like(last[:1]), last])
+    found["last.bias"] = torch.cat([bias.new_full((1,), SHARE), bias])
+    return found

@@ -1,0 +1,89 @@
+"""Noise-free captures of painted scenes by the cameras of a pool, rendered once and stored in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.filters import gaussian_blur2d
+from torch import Tensor
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data.photo_collages import grain
+from kornia_tidy.data.photographic_leaves import photographic_leaves
+from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.seeds import keyed_seed
+from tests.benchmarks.any_camera.cameras import SHIPPED, camera, pool_names
+
+SIDE = 192  # px of a scene
+SCENES, SCENES_OF_SHIPPED = 32, 96
+LEVELS = 2**16 - 1
+KINDS = ("leaves", "leaves", "leaves", "grain", "soft", "blank", "sharp")  # as often
+
+
+class Captures(NamedTuple):
+    """A camera's captures and their scenes in linear light, each (N, 3, H, W) uint16."""
+
+    light: np.ndarray
+    image: np.ndarray
+
+
+def painted_scene(seed: int, side: int = SIDE) -> tuple[Tensor, Tensor]:
+    """Return a painted scene of a kind drawn by the seed: sRGB (3, H, W), and normalised inverse depth (1, H, W).
+
+    Beside leaves with the statistics of photographs there are such with grain, soft ones (out of a camera's focus),
+    nearly blank ones, and sharp leaves of large contrast.
+    """
+    random = torch.Generator().manual_seed(seed)
+    kind = KINDS[int(torch.randint(len(KINDS), (), generator=random))]
+    place = float(torch.rand((), generator=random))
+    paint = dead_leaves if kind == "sharp" else photographic_leaves
+    image, depth = paint(side, side, depth_range=(1.0, float("inf")), seed=seed)
+    if kind == "grain":
+        image = image + torch.from_numpy(grain(side, side, np.random.default_rng(seed)))
+    elif kind == "soft":
+        sigma = 0.8 * 4**place
+        light = gaussian_blur2d(rgb_to_linear_rgb(image[None]), (25, 25), (sigma, sigma), "replicate")
+        image = linear_rgb_to_rgb(light)[0]
+    elif kind == "blank":
+        mean = image.mean((1, 2), keepdim=True)
+        image = mean + (0.02 + 0.2 * place) * (image - mean)
+    return image.clamp(0, 1), 1 / depth
+
+
+@torch.no_grad()
+def photographed(optics: TiDyOptics, image: Tensor, inverse_depth: Tensor) -> Tensor:
+    """Return the noise-free capture in linear light, (3, H, W), of a scene stretched over the camera's depths."""
+    capture = optics(image[None], metres(optics.camera, inverse_depth[None]))
+    return optics.decode(capture)[0].clamp(0, 1)
+
+
+def stored(folder: Path, name: str, scenes: int | None = None) -> Captures:
+    """Return the captures of a camera, which are made if they are not in the folder."""
+    light, image = (folder / f"{name}-{part}.npy" for part in ("light", "image"))
+    if not light.exists():
+        count = scenes or (SCENES_OF_SHIPPED if name in SHIPPED else SCENES)
+        optics = camera(name)
+        seen, shown = [], []
+        for index in range(count):
+            scene, near = painted_scene(keyed_seed(f"{name} scenes", index))
+            seen.append(photographed(optics, scene, near))
+            shown.append(rgb_to_linear_rgb(scene[None])[0])
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, part in ((image, shown), (light, seen)):
+            values = (torch.stack(part) * LEVELS).round().numpy().astype(np.uint16)
+            with open(partial := path.with_suffix(".partial"), "wb") as file:
+                np.save(file, values)
+            partial.rename(path)
+    return Captures(np.load(light, mmap_mode="r"), np.load(image, mmap_mode="r"))
+
+
+def photograph(folder: Path, pool: str, scenes: int | None = None) -> None:
+    """Make the captures of a whole pool."""
+    for name in pool_names(pool):
+        stored(folder, name, scenes)
+        print(name, flush=True)

@@ -1,0 +1,208 @@
+"""Training of the network ``any-camera``: batches of crops of several cameras, their noise drawn anew in each step."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb
+from torch import Tensor
+from torch.nn import functional
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.files import write_bytes
+from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED, RuledClosedForm
+from kornia_tidy.reconstruction.trained import closed_form_bank
+from kornia_tidy.seeds import keyed_seed
+from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.training.average import MovingAverage
+from kornia_tidy.training.noisy_crops import random_gain
+from kornia_tidy.training.task_loss import psnr_ssim_loss
+from tests.benchmarks.any_camera.cameras import SHIPPED, camera, pool_names
+from tests.benchmarks.any_camera.captures import LEVELS, stored
+
+CROP = 128  # px
+CAMERAS_A_STEP, CROPS_A_CAMERA = 3, 2
+ELECTRONS = (200.0, 100_000.0)  # of white, uniform in their logarithm
+READ_ELECTRONS = (1.0, 5.0)
+NOISE_ERROR = 1.5  # largest factor by which the noise told is wrong
+BITS = (8, 10, 12, 14, 16)
+RATE, WARM_UP = 3e-4, 50
+DECAY = 0.998
+SHIPPED_SHARE = 0.25
+START = "edof-5"
+SAVED_EVERY = 100  # steps
+
+
+OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
+MISTAKEN, MISTAKES = 0.35, 2  # share of draws with PSFs of a camera that is a little different; kinds of each camera
+LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors of pitch and aperture; of the mask in pupils; of focus in radians
+DEMOSAICED = 0.2  # share of draws behind a Bayer filter
+
+
+class Cameras:
+    """The cameras of a pool: their captures, and their closed forms, made when they are first used."""
+
+    def __init__(self, folder: Path, pool: str) -> None:
+        self.folder, self.names = folder, pool_names(pool)
+        self.forms: dict[tuple[str, int], RuledClosedForm] = {}
+
+    def form(self, name: str, mistake: int = 0) -> RuledClosedForm:
+        """Return the closed form of a camera, or of one that differs by small errors, numbered from 1."""
+        if (name, mistake) not in self.forms:
+            optics = mistaken(camera(name), keyed_seed(name, mistake)) if mistake else camera(name)
+            form = RuledClosedForm(7)
+            form.set_psfs(closed_form_bank(optics, form.layers))
+            self.forms[name, mistake] = form.requires_grad_(requires_grad=False)
+        return self.forms[name, mistake]
+
+    def crops(self, name: str, count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return noise-free crops of captures and scenes in linear light."""
+        captures = stored(self.folder, name)
+        side, found = captures.light.shape[-1], []
+        for _ in range(count):
+            index = int(torch.randint(len(captures.light), (), generator=random))
+            top, left = torch.randint(side - CROP + 1, (2,), generator=random).tolist()
+            window = (index, slice(None), slice(top, top + CROP), slice(left, left + CROP))
+            found.append([torch.from_numpy(part[window].astype(np.float32)) / LEVELS for part in captures])
+        light, image = (torch.stack(part) for part in zip(*found, strict=True))
+        return light, image
+
+
+def mistaken(optics: TiDyOptics, seed: int) -> TiDyOptics:
+    """Return a camera that differs by what a laboratory cannot hold: pitch, aperture, focus, mask place."""
+    random = torch.Generator().manual_seed(seed)
+    pitch, aperture, focus, down, across = (2 * torch.rand(5, generator=random, dtype=torch.float64) - 1).tolist()
+    lens: Any = optics.camera
+    f_number = lens.f_number * (1 + LENGTHS * aperture)
+    radius = lens.focal_length / (2 * f_number)
+    moved = 1 / float(lens.focus_distance) + FOCUS * focus * REFERENCE_WAVELENGTH / (math.pi * radius**2)
+    other = ThinLensCamera(
+        lens.focal_length,
+        f_number=f_number,
+        focus_distance=1 / max(moved, 1e-6),
+        pixel_pitch=lens.pixel_pitch * (1 + LENGTHS * pitch),
+        depth_range=lens.depth_range,
+    )
+    masks = optics.masks
+    if not isinstance(masks, NoMask):
+        heights = masks.heights().detach()
+        shift = 2 * SHIFT / MASK_SPAN * torch.tensor([across, down])  # of the sides, in units of half of them
+        grid = functional.affine_grid(
+            torch.cat([torch.eye(2), shift[:, None]], 1).expand(len(heights), 2, 3),
+            [len(heights), 1, *heights.shape[-2:]],
+            align_corners=False,
+        ).to(heights)
+        masks = PixelwiseMask(
+            initial=functional.grid_sample(heights[:, None], grid, padding_mode="border", align_corners=False)[:, 0]
+        )
+    return TiDyOptics(masks, other, fidelity=optics.fidelity, sensor=None).requires_grad_(requires_grad=False)
+
+
+def drawn_sensor(random: torch.Generator) -> SensorNoise:
+    """Return a random sensor."""
+    place, read = torch.rand(2, generator=random, dtype=torch.float64).tolist()
+    electrons = ELECTRONS[0] * (ELECTRONS[1] / ELECTRONS[0]) ** place
+    bits = BITS[int(torch.randint(len(BITS), (), generator=random))]
+    read = READ_ELECTRONS[0] * (READ_ELECTRONS[1] / READ_ELECTRONS[0]) ** read
+    return SensorNoise(read / electrons, full_well=electrons, bits=bits)
+
+
+def demosaiced(light: Tensor) -> Tensor:
+    """Return pictures as behind a Bayer filter, interpolated linearly."""
+    mosaic = torch.zeros_like(light[:, :1])
+    for color, (row, column) in zip((0, 1, 1, 2), ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
+        mosaic[:, 0, row::2, column::2] = light[:, color, row::2, column::2]
+    return raw_to_rgb(mosaic, CFA.BG).clamp(0, 1)
+
+
+@torch.no_grad()
+def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the closed form's image, the maps for the network, the truth, and where the capture is not clipped.
+
+    They follow from the step alone.
+    """
+    random = torch.Generator().manual_seed(keyed_seed("any-camera", step))
+    torch.manual_seed(keyed_seed("any-camera gains", step))
+    parts = []
+    for _ in range(CAMERAS_A_STEP):
+        shipped = float(torch.rand((), generator=random)) < SHIPPED_SHARE
+        names = SHIPPED if shipped else cameras.names[len(SHIPPED) :]
+        name = names[int(torch.randint(len(names), (), generator=random))]
+        light, image = cameras.crops(name, CROPS_A_CAMERA, random)
+        chance = torch.rand(4, generator=random, dtype=torch.float64).tolist()
+        gain = random_gain(torch.maximum(light.amax((0, 2, 3)), image.amax((0, 2, 3))))
+        if chance[0] < OVEREXPOSED:
+            gain = gain * 4 ** (chance[0] / OVEREXPOSED)
+        sensor = drawn_sensor(random)
+        noisy = sensor(light * gain, generator=random)
+        told = sensor.std(noisy) * NOISE_ERROR ** (2 * chance[1] - 1)
+        if chance[2] < DEMOSAICED:
+            noisy = demosaiced(noisy)
+        form = cameras.form(name, 1 + int(chance[3] / MISTAKEN * MISTAKES) if chance[3] < MISTAKEN else 0)
+        restored = form(linear_rgb_to_rgb(noisy), told)
+        truth = linear_rgb_to_rgb((image * gain).clamp(0, 1))
+        parts.append((restored.image, restored.maps, truth, (noisy < CLIPPED).all(1, keepdim=True)))
+    whole = [torch.cat(part) for part in zip(*parts, strict=True)]
+    turns, mirrored = int(torch.randint(4, (), generator=random)), bool(torch.randint(2, (), generator=random))
+    turned = [part.rot90(turns, (2, 3)) for part in whole]
+    return tuple(part.flip(3) if mirrored else part for part in turned)  # ty: ignore[invalid-return-type]
+
+
+def start() -> AnyCameraHead:
+    """Return the network before the first step, with the weights of a shipped one."""
+    head = AnyCameraHead()
+    trained: Any = load_pretrained(START).head
+    head.network.load_state_dict(from_one_camera(trained.network.state_dict(), head))
+    return head
+
+
+def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
+    """Train; goes on from the checkpoint in the folder, and ends after so many steps or minutes."""
+    cameras, path = Cameras(folder / "captures", "training"), folder / "checkpoint.pt"
+    network = start().network.train().to(memory_format=torch.channels_last)
+    average = MovingAverage(network, DECAY)
+    optimizer = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=0.0)
+    step, log = 0, []
+    if path.exists():
+        state = torch.load(path, weights_only=True)
+        network.load_state_dict(state["network"])
+        average.load_state_dict(state["average"])
+        optimizer.load_state_dict(state["optimizer"])
+        step, log = state["step"], state["log"]
+    began = time.monotonic()
+    while step < steps and time.monotonic() - began < 60 * minutes:
+        for group in optimizer.param_groups:
+            falling = 0.5 * (1 + math.cos(math.pi * step / steps))
+            group["lr"] = RATE * min(1, (step + 1) / WARM_UP) * (0.05 + 0.95 * falling)
+        first, maps, truth, known = batch(cameras, step)
+        estimate = corrected(first, network(maps.contiguous(memory_format=torch.channels_last)))
+        loss = psnr_ssim_loss(estimate, truth, known)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        average.update(network)
+        step += 1
+        with torch.no_grad():
+            log.append([float(loss), float(psnr_ssim_loss(first, truth, known))])
+        if step % SAVED_EVERY == 0 or step == steps:
+            recent = np.mean(log[-SAVED_EVERY:], 0)
+            seconds = time.monotonic() - began
+            print(f"step {step}: loss {recent[0]:.3f}, closed form {recent[1]:.3f}, {seconds:.0f} s", flush=True)
+            state = {"network": network, "average": average, "optimizer": optimizer}
+            held = {name: part.state_dict() for name, part in state.items()} | {"step": step, "log": log}
+            torch.save(held, path.with_suffix(".partial"))
+            path.with_suffix(".partial").rename(path)
+    record = {"step": step, "log": log}
+    write_bytes(folder / "training.json", json.dumps(record).encode())

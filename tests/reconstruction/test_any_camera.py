@@ -1,0 +1,86 @@
+"""The network for any camera: what it adds to the closed form, and where its weights come from."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from kornia_tidy.reconstruction import AnyCameraHead, NAFNet, closed_form_channels, reconstruct_tiled
+from kornia_tidy.reconstruction.any_camera import SHARE, from_one_camera
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from tests.base import BaseTester
+from tests.reconstruction.test_closed_form import bank, photo
+
+
+def head_of(dtype=torch.float32, *, trained=False):
+    torch.manual_seed(0)
+    head = AnyCameraHead(width=2, repeats=1).eval().to(dtype)
+    head.closed_form.set_psfs(bank(7, dtype=dtype))
+    if trained:
+        generator = torch.Generator().manual_seed(1)
+        for parameter in head.network.parameters():
+            if not parameter.any() or parameter is head.network.last.bias:
+                torch.nn.init.normal_(parameter, std=0.05, generator=generator)
+        torch.nn.init.normal_(head.network.last.weight, std=0.02, generator=generator)
+    return head
+
+
+class TestAnyCameraHead(BaseTester):
+    def test_smoke_begins_as_the_closed_form(self):
+        head, capture = head_of(), photo(32, 48, dtype=torch.float32)
+        with torch.no_grad():
+            self.assert_close(head(capture, 0.01), head.closed_form(capture, 0.01).image)
+
+    def test_cardinality(self):
+        for size in [(33, 31), (1, 50), (1, 1)]:
+            assert head_of()(photo(*size, dtype=torch.float32)).shape == (2, 3, *size)
+
+    def test_feature_a_share_of_zero_is_the_closed_form_and_of_one_the_whole_correction(self):
+        head, capture = head_of(torch.float64, trained=True), photo(32, 32)
+        with torch.no_grad():
+            restored = head.closed_form(capture, 0.01)
+            head.network.last.weight[0] = 0
+            found = []
+            for logit in (-50.0, 50.0):
+                head.network.last.bias[0] = logit
+                found.append(head(capture, 0.01))
+            correction = head.network(restored.maps)[:, 1:]
+        self.assert_close(found[0], restored.image)
+        self.assert_close(found[1], restored.image + correction)
+        assert correction.abs().max() > 1e-3
+
+    def test_feature_weights_of_one_camera_give_their_correction_times_the_share(self):
+        """With the maps of the ruled closed form: the network of one camera sees the first of them."""
+        torch.manual_seed(1)
+        own = ClosedFormHead(NAFNet(closed_form_channels(7), 3, width=2), 7).double().eval()
+        torch.nn.init.normal_(own.network.last.weight, std=0.1)
+        head, capture = head_of(torch.float64), photo(32, 32)
+        head.network.load_state_dict(from_one_camera(own.network.state_dict(), head))
+        with torch.no_grad():
+            restored = head.closed_form(capture, 0.01)
+            correction = own.network(restored.maps[:, : closed_form_channels(7)])
+            share = torch.tensor(SHARE).sigmoid().double()
+            self.assert_close(head(capture, 0.01), restored.image + share * correction, rtol=1e-6, atol=1e-7)
+
+    def test_feature_another_camera_needs_no_other_weights(self):
+        head, capture = head_of(trained=True), photo(32, 32, dtype=torch.float32)
+        weights = {name: value.clone() for name, value in head.network.state_dict().items()}
+        with torch.no_grad():
+            first = head(capture, 0.01)
+            head.closed_form.set_psfs(bank(7, side=9, dtype=torch.float32))
+            assert not torch.equal(head(capture, 0.01), first)
+        assert all(torch.equal(value, weights[name]) for name, value in head.network.state_dict().items())
+
+    def test_feature_tiles_are_the_whole_picture(self):
+        head, capture = head_of(trained=True), photo(40, 480, dtype=torch.float32)[:1]
+        with torch.no_grad():
+            whole, tiled = head(capture), reconstruct_tiled(head, capture, tile=(48, 416))
+        self.assert_close(tiled, whole, atol=1e-3, rtol=0)
+
+    def test_exception_no_psfs(self):
+        with pytest.raises(ValueError, match="the closed form does not know its camera"):
+            AnyCameraHead(width=2)(photo(16, 16, dtype=torch.float32))
+
+    def test_exception_channels(self):
+        with pytest.raises(ValueError, match="image must have 3 channels, got 1"):
+            head_of()(torch.rand(1, 1, 16, 16))

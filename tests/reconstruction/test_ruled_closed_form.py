@@ -1,0 +1,156 @@
+"""The closed form whose settings follow from PSFs and noise: its predictions against simulated pictures."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from kornia_tidy import SensorNoise
+from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction import RuledClosedForm, reconstruct_tiled
+from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, band_facts, light_detail, predicted_errors
+from tests.base import BaseTester
+from tests.reconstruction.test_closed_form import bank, photo
+
+
+def ruled(psfs=None, layers=0, dtype=torch.float64):
+    restore = RuledClosedForm(layers).to(dtype)
+    restore.set_psfs(bank(layers or NODES, dtype=dtype) if psfs is None else psfs)
+    return restore
+
+
+def painted(side, count, seed=0):
+    """Periodic random pictures with the power spectrum of photographs, without mean, (count, 1, side, side)."""
+    noise = torch.randn(count, 1, side, side, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    power = PHOTOGRAPHS.cell_power(side) * side**2
+    power[:, 1 : (side + 1) // 2] /= 2
+    power[0, 0] = 0
+    return torch.fft.irfft2(torch.fft.rfft2(noise) * power.sqrt(), s=(side, side))
+
+
+def circular(image, kernel):
+    side, reach = image.shape[-1], kernel.shape[-1]
+    plane = torch.zeros(*kernel.shape[:-2], side, side, dtype=image.dtype)
+    plane[..., :reach, :reach] = kernel
+    plane = plane.roll((-(reach // 2), -(reach // 2)), (-2, -1))
+    return torch.fft.irfft2(torch.fft.rfft2(image) * torch.fft.rfft2(plane), s=(side, side))
+
+
+class TestRuledClosedForm(BaseTester):
+    def test_smoke_maps_of_the_closed_form_and_of_the_camera(self):
+        capture = photo(16, 20)
+        restored = ruled(layers=7)(capture, 0.01)
+        assert restored.maps.shape == (2, closed_form_channels(7) + CAMERA_MAPS, 16, 20)
+        self.assert_close(restored.maps[:, :3], capture)
+
+    def test_feature_the_error_without_noise_is_that_of_simulated_pictures(self):
+        """Periodic pictures of the spectrum, blurred and restored by the definition; 400 of them."""
+        psfs = bank(NODES).psfs
+        restore = ruled()
+        side = 5 + restore.kernels.shape[-1] + 1  # 28: the plane on which it is predicted, or one like it
+        shares = PHOTOGRAPHS.depth_weights(torch.linspace(-1, 1, NODES, dtype=torch.float64))
+        scenes = painted(side, 400)
+        found = torch.zeros(len(WIENER_NOISES), dtype=torch.float64)
+        for share, psf in zip(shares, psfs, strict=True):
+            seen = circular(scenes, psf)
+            for index, kernel in enumerate(restore.kernels):
+                found[index] += share * (circular(seen, kernel) - scenes).square().mean()
+        told, _ = predicted_errors(psfs, restore.kernels)
+        assert ((told / found).log().abs() < 0.1).all()
+
+    def test_feature_photographs_have_the_detail_that_is_foretold(self):
+        psfs = bank(NODES).psfs
+        _, detail = predicted_errors(psfs, torch.zeros(1, 3, 59, 59, dtype=torch.float64))  # a plane of 64 pixels
+        shares = PHOTOGRAPHS.depth_weights(torch.linspace(-1, 1, NODES, dtype=torch.float64))
+        scenes = painted(64, 50)
+        found = sum(s * light_detail(circular(scenes, psf)).mean() for s, psf in zip(shares, psfs, strict=True))
+        assert abs(math.log(float(detail / found))) < 0.1
+
+    @pytest.mark.parametrize("noise", [0.002, 0.01, 0.03])
+    def test_feature_the_kernel_is_the_one_of_least_error_on_simulated_pictures(self, noise):
+        """Of 61 blends of two kernels each, by simulated scene and noise: the chosen one is within 5 % of the best."""
+        restore = ruled()
+        scenes = 0.4 + 0.5 * painted(96, 6, seed=1).clamp(-0.7, 1).expand(-1, 3, -1, -1)
+        psf = bank(NODES).psfs.mean(0)
+        seen = torch.cat([circular(scenes[:, c : c + 1], psf[c]) for c in range(3)], 1)
+        seen = seen + noise * torch.randn(seen.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        estimates = convolve_kernels(seen, restore.kernels)
+
+        def error(place):
+            low = min(int(place), 2)
+            blend = (1 - place + low) * estimates[:, low] + (place - low) * estimates[:, low + 1]
+            return float((blend - scenes).square().mean())
+
+        level = torch.full((6, 3, 96, 96), math.log10(noise), dtype=torch.float64)
+        chosen = restore._place(level, seen).flatten()
+        errors = [error(i / 20) for i in range(61)]
+        assert error(float(chosen.mean())) < 1.05 * min(errors)
+
+    def test_feature_a_cut_kernel_is_taken_less_sharp(self):
+        """Two far points as a PSF: its inverse reaches far beyond the window, and the sharpest one is worse."""
+        psfs = torch.zeros(NODES, 3, 9, 9, dtype=torch.float64)
+        psfs[..., 4, 0], psfs[..., 4, 8] = 0.5, 0.5
+        restore = ruled(PSFBank.from_measured(psfs, torch.arange(float(NODES), dtype=torch.float64)))
+        level = torch.full((2, 3, 40, 40), math.log10(8e-4), dtype=torch.float64)
+        scene = photo(40, 40)
+        assert restore.scene_errors.argmin() > 0
+        assert (restore._place(level, scene) > 0).all()
+        assert (ruled()._place(level, scene) < 0.5).all()
+
+    def test_feature_a_blank_scene_is_smoothed_more(self):
+        restore, capture = ruled(), photo(40, 40)
+        level = torch.full_like(capture, -2.0)
+        assert (restore._place(level, 0.3 + 0.02 * capture) > restore._place(level, capture) + 0.5).all()
+
+    def test_feature_noise_counts_by_its_mean_variance(self):
+        restore, capture = ruled(), photo(16, 16)
+        noise = 0.01 + 0.02 * torch.rand(2, 3, 16, 16, dtype=torch.float64)
+        even = noise.square().mean((1, 2, 3), keepdim=True).sqrt()
+        self.assert_close(restore(capture, noise).image, restore(capture, even).image)
+
+    def test_feature_tiles_are_the_whole_picture(self):
+        head = ClosedFormHead()
+        head.closed_form = ruled(dtype=torch.float32)
+        head.eval()
+        head.closed_form.set_noise(SensorNoise(0.003, full_well=2000.0))
+        capture = photo(40, 330, dtype=torch.float32)[:1]
+        capture[..., :100] *= 0.5
+        with torch.no_grad():
+            whole, tiled = head(capture), reconstruct_tiled(head, capture, tile=(48, 160))
+        self.assert_close(tiled, whole, atol=2e-3, rtol=0)
+        assert (tiled - whole).abs().mean() < 2e-5
+
+    def test_feature_clipped_pixels_are_told(self):
+        capture = photo(16, 16)
+        capture[0, 1, 3, 4] = 1.0
+        known = ruled()(capture, 0.01).maps[:, -CAMERA_MAPS]
+        assert (known == 0).nonzero().tolist() == [[0, 3, 4]]
+
+    def test_feature_bands_of_a_mirror_without_blur_are_whole(self):
+        lost, transfer = band_facts(torch.eye(1, dtype=torch.float64).expand(NODES, 3, 1, 1))
+        assert (lost[:, :3] < lost[:, 1:]).all()
+        self.assert_close(transfer, torch.ones_like(transfer))
+
+    def test_exception_no_psfs(self):
+        with pytest.raises(ValueError, match="the closed form does not know its camera"):
+            RuledClosedForm()(photo(16, 16))
+
+    def test_gradcheck_captures(self):
+        restore = ruled()
+        self.gradcheck(lambda capture: restore(capture, 0.01).image, (photo(12, 12),))
+
+    def test_smoke_takes_the_noise_of_a_sensor(self):
+        restore = ruled()
+        restore.set_noise(SensorNoise(0.01))
+        self.assert_close(restore(photo(16, 16)).image, restore(photo(16, 16), 0.01).image)
+
+    def test_feature_other_closed_forms_keep_their_settings(self):
+        plain = ClosedForm(inverse="wiener").double()
+        plain.set_psfs(bank(NODES))
+        assert not torch.equal(plain(photo(16, 16), 0.01).image, ruled()(photo(16, 16), 0.01).image)
