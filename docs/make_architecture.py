@@ -56,7 +56,7 @@ def parts(root: Path) -> dict[str, str]:
 
 
 def packages_in_order(root: Path) -> list[str]:
-    """Return the packages that are there, from the bottom up, as .importlinter lists them."""
+    """Return the packages from the bottom up, as .importlinter lists them."""
     contracts = configparser.ConfigParser()
     contracts.read(root / ".importlinter", encoding="utf-8")
     words = re.findall(r"\w+", contracts["importlinter:contract:layers"]["layers"])

@@ -12,14 +12,15 @@ from tests.extremes.row import Row
 INTRODUCTION = """\
 # Extremes
 
-How exact captures are far from usual settings, and what happens beyond what is allowed. Every row was measured by
+This page lists the error of captures far from usual settings, and the refusals beyond the allowed values. Every row
+was measured by
 `make extremes`, which writes this page; `tests/extremes/test_extremes.py` checks the quick rows in every test run.
 
 * **Error**: the largest over all values of the row. Where it says float64, the same capture was computed in float64
   with otherwise the same settings; images are random, depths jump between 0.3 m and infinity.
-* **Allowed**: what the test admits. Captures in float32 must be within 1e-4 of full scale.
+* **Allowed**: the limit in the test. Captures in float32 must be within 1e-4 of full scale.
 * **Refused**: `ValueError` or `TypeError` with one sentence, before any work. The table shows the first one.
-* **Not measured**: the machine has no device for the row, which is told; where there is one, the row is measured.
+* **Not measured**: the machine has no device for the row; a machine with the device measures it.
 """
 
 EXPLANATION = """\
@@ -36,7 +37,7 @@ The error hardly grows with anything, for these reasons:
 * Defocus reaches PSFs through integrals over the pixels of the mask, which are computed in float64 and rounded once; a
   large defocus costs no digits. Whole waves of the masks' phase are taken off in float64 before it meets them.
 * K masks are averaged: errors are weighted by 1/K each, and a sum of K terms in order adds at most K roundings of a
-  value below 1, of which random ones cancel to about their square root.
+  value below 1, whose random parts cancel to about their square root.
 * PSFs sum to one, so a convolution is a weighted mean: its error is bounded by gamma(n) of
   `tests/rounding.py` times the largest value, and by transforms it grows as the logarithm of their
   size.

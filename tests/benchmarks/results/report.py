@@ -27,7 +27,7 @@ PICTURE = "images/results.png"
 INTRODUCTION = """\
 # Results
 
-What each optical system and each restoration make of the same scenes. `python -m tests.benchmarks.results` measures
+This page compares optical systems and restorations on the same scenes. `python -m tests.benchmarks.results` measures
 this page, and goes on where it was interrupted.
 
 - **Scenes.** The 35 real scenes of `../shared/data`, the middle 512 pixels, depths stretched in dioptres over the
@@ -39,17 +39,17 @@ this page, and goes on where it was interrupted.
   is a standard deviation in parts of full scale; at the same fixed noise a smaller aperture is exposed for longer.
   Electrons are those of a white pixel at f/17.6; other f-numbers have the same exposure time, shot noise and 2.4
   electrons of read noise. All systems get the same random numbers.
-- **Restorations** take the capture, the camera's PSFs and the noise level. *Capture* is the capture as it is.
+- **Restorations** take the capture, the camera's PSFs and the noise level. *Capture* is the unrestored capture.
   *Tikhonov* inverts the mean PSF of all depths with one weight for all frequencies, in linear light, towards the
   capture; *by estimated depth* it inverts the PSFs of 11 depths, blended by the depth that the network estimates.
   *Wiener* weighs frequencies by the mean PSF, the noise and the power spectrum of photographs; the factor is that of
-  the noise's power. *Bilateral* is OpenCV's filter on the result, 7 pixels wide. *Network* is the one that was trained
-  with the camera; *in 8 orientations* it is the mean of what it makes of its input turned and mirrored.
+  the noise's power. *Bilateral* is OpenCV's filter on the result, 7 pixels wide. *Network* is the network trained
+  with the camera; *in 8 orientations* is the mean of its results for the turned and mirrored capture.
 - **Scores** are those of sRGB images clipped to [0, 1]. Chroma PSNR is that of Cb and Cr. ± is the standard error of
   the mean of differences, taken scene by scene.
 - **Systems.** `edof-5` has five masks, `edof-1` one, and `edof-0` a Fresnel element of 10 rad, the paper's camera of
-  no masks. `joint` systems estimate depth too. *As trained* is the camera in the small window of its training, whose
-  PSFs are scaled to sum one: without stray light. *Flat* is a lens without masks at its f-number. *Preset* is a
+  no masks. `joint` systems also estimate depth. *As trained* is the camera with the small window of its training,
+  PSFs scaled to sum one, and no stray light. *Flat* is a lens without masks at its f-number. *Preset* is a
   published camera with its masks as before training.
 """
 
@@ -58,7 +58,7 @@ def page(results: Results, cells: Sequence[Measured], recommended: Mapping[str, 
     """Return the whole page."""
     lines = [INTRODUCTION, _measured_where(cells), "", *_missing(results, cells), ""]
     lines += [f"![PSNR over noise and over f-number]({PICTURE})", "", "## Targets", ""]
-    lines += ["On half B of the real scenes; what they ask for is in dB unless it says otherwise.", ""]
+    lines += ["On half B of the real scenes; targets are in dB unless another unit is given.", ""]
     lines += [*in_words(verdicts(results, recommended)), ""]
     for scenes in results.sets:
         title = SET_NAMES.get(scenes, scenes)
