@@ -80,8 +80,9 @@ centred at its centroid, and shifts by the masks are not measured.
 
 In Python:
   from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+  from kornia_tidy.reconstruction import Tikhonov
   measured = MeasuredPSFs.load("bank.safetensors")  # .bank, .uncertainty, .distances, .reports
-  sharp = Tikhonov()(capture, measured.bank)        # kornia_tidy.reconstruction, on linear light
+  sharp = Tikhonov()(capture, measured.bank)        # on linear light
 """
     examples: ClassVar = """\
   Three distances, 8 places of the point at each:
