@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from kornia_tidy import cli
-from kornia_tidy.cli.commands import info
 from kornia_tidy.kernels import build as compiled
-from kornia_tidy.kernels import gather_ops
+from kornia_tidy.kernels import gather_ops, report
 from tests.base import BaseTester
 from tests.kernels.test_build import forget
 
@@ -39,7 +38,7 @@ class TestInfo(BaseTester):
         topics = self.told(capsys)
         assert f"torch {torch.__version__.split('+', maxsplit=1)[0]}" in topics["uses"][0]
         assert f"{os.cpu_count()} CPUs" in topics["processor"][0]
-        assert len(topics["kernel"]) == 2 * len(info.SOURCES)
+        assert len(topics["kernel"]) == 2 * len(report.SOURCES)
 
     @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")
     def test_feature_kernels_and_their_cache(self, capsys):
@@ -50,7 +49,7 @@ class TestInfo(BaseTester):
     @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")
     def test_feature_libraries_that_were_removed_meanwhile(self, capsys, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        monkeypatch.setattr(info, "SOURCES", info.SOURCES[-1:])
+        monkeypatch.setattr(report, "SOURCES", report.SOURCES[-1:])
         assert self.told(capsys)["cache"][0].startswith(f"{tmp_path}/cache/kornia_tidy, 2 files, ")
         shutil.rmtree(tmp_path / "cache")
         topics = self.told(capsys)
@@ -67,5 +66,5 @@ class TestInfo(BaseTester):
     def test_feature_the_home_folder_is_not_named(self, capsys, tmp_path, monkeypatch):
         monkeypatch.setenv("HOME", str(tmp_path))
         monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-        monkeypatch.setattr(info, "SOURCES", ())
+        monkeypatch.setattr(report, "SOURCES", ())
         assert self.told(capsys)["cache"][0].startswith("~/.cache/kornia_tidy, ")
