@@ -7,6 +7,7 @@ from functools import reduce
 from typing import Any, cast
 
 import kornia.augmentation as K
+import torch
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, container_leaves, moves_pixels
@@ -16,6 +17,7 @@ from kornia_tidy.camera.holes import DEPTH_KEYS, both_valid, fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.psf.field import check_centers
 
 
 class OpticsPipeline(nn.Module):
@@ -51,6 +53,8 @@ class OpticsPipeline(nn.Module):
         - A mapping's masks, boxes and keypoints are warped too, by the names that kornia knows; ``"valid"``, and
           ``"mask"`` if it is bool, tell where the depth is valid.
         - :attr:`params` holds the draws of the last call; ``params=`` repeats them.
+        - Behind a lens the geometry says where crops lie in its field, counted from the entry ``"field_center"`` of a
+          mapping if it has one; a mapping comes back with the place of the capture under this name.
 
     Example:
         >>> import kornia.augmentation as K
@@ -101,7 +105,8 @@ class OpticsPipeline(nn.Module):
         if isinstance(image, (tuple, list)):
             if len(image) < 2 or depth is not None:
                 raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
-            coded, warped, _, valid, _ = self._scene(image[0], image[1], getattr(image, "valid", None), {}, params)
+            given = image[0], image[1], getattr(image, "valid", None), {}, params
+            coded, warped, _, valid, _ = self._scene(*given, getattr(image, "field_center", None))
             parts, make = [coded, warped, *image[2:]], cast("Any", type(image))
             if not hasattr(image, "_fields"):
                 return make(parts)
@@ -131,8 +136,11 @@ class OpticsPipeline(nn.Module):
         taken = ("image", keys[0], *given)
         others = {} if self.geometry is None else warped_entries(sample, taken)
         known = reduce(both_valid, given.values()) if given else None
-        coded, depth, clean, valid, warped = self._scene(sample["image"], sample[keys[0]], known, others, params)
+        place = sample.get("field_center")
+        coded, depth, clean, valid, warped = self._scene(sample["image"], sample[keys[0]], known, others, params, place)
         out = {**sample, **warped, "image": coded, "all_in_focus": clean, keys[0]: depth}
+        if "field_center" in self.params:
+            out["field_center"] = self.params["field_center"]
         names = [*given, *(["valid"] if fills_holes(self.optics, self.holes) else [])]
         if valid is not None and not names and not bool(valid.all()):
             names = ["mask" if mask is None else "mask_of_valid_depth"]
@@ -145,20 +153,23 @@ class OpticsPipeline(nn.Module):
         valid: Tensor | None,
         others: Mapping[str, Any],
         params: Mapping[str, Any] | None,
+        place: Any = None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Mapping[str, Any]]:
         """Return capture, depth, clean image, where the depth is valid, and the other entries."""
-        given, drawn, fills = params or {}, {}, fills_holes(self.optics, self.holes)
+        given, drawn, fills, before = params or {}, {}, fills_holes(self.optics, self.holes), image
         if self.geometry is not None:
             image, depth, valid, others = self.geometry(image, depth, valid, others, params=given.get("geometry"))
             drawn["geometry"] = self.geometry.params
         elif fills:
             depth, known = fill_holes(depth)
             valid = known if valid is None else both_valid(known, valid)
+        if (place := given.get("field_center", self._place(before, image, place))) is not None:
+            drawn["field_center"] = place
         if isinstance(self.optics, TiDyOptics):
             drawn["optics"] = given["optics"] if "optics" in given else self.optics.draw(image)
-            coded = self.optics(image, depth, params=drawn["optics"])
+            coded = self.optics(image, depth, params=drawn["optics"], field_center=place)
         else:
-            coded = self.optics(image, depth, params=given.get("optics"))
+            coded = self.optics(image, depth, params=self._draws(image, given.get("optics"), place))
             drawn["optics"] = self.optics._params
             coded = coded.reshape(image.shape)
         if self.photometry is not None:
@@ -166,3 +177,25 @@ class OpticsPipeline(nn.Module):
             drawn["photometry"] = self.photometry._params
         self.params = drawn
         return coded, depth, image, valid, others
+
+    def _place(self, before: Tensor, after: Tensor, place: Any) -> Any:
+        """Return where the warped pictures lie in the field of the camera's lens; None where nothing says it."""
+        camera = self._camera
+        if camera is None or camera.lens is None or self.geometry is None:
+            return place
+        return self.geometry.field_center(before, after, camera.field_center if place is None else place)
+
+    def _draws(self, image: Tensor, params: dict[str, Any] | None, place: Any) -> dict[str, Any] | None:
+        """Return the draws of an augmentation, with the place of each image where that is known."""
+        optics, camera = self.optics, self._camera
+        if place is None or params is not None or camera is None or camera.lens is None:
+            return params
+        assert isinstance(optics, DepthAugmentation)
+        shape = image.shape if image.ndim == 4 else (1, *image.shape)
+        centers = torch.tensor(check_centers(place, shape[0]), dtype=torch.float64).expand(shape[0], 2)
+        return optics.forward_parameters(shape) | {"field_center": centers}
+
+    @property
+    def _camera(self) -> TiDyOptics | None:
+        camera = self.optics if isinstance(self.optics, TiDyOptics) else getattr(self.optics, "optics", None)
+        return camera if isinstance(camera, TiDyOptics) else None

@@ -14,7 +14,7 @@ from torch import Tensor
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.drawn_camera import DrawnOptics, RowSensors, drawn_camera, sensor_with
 from kornia_tidy.augmentation.ranges import Range, checked_range
-from kornia_tidy.augmentation.rows import row_seeds
+from kornia_tidy.augmentation.rows import row_places, row_seeds
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
 
@@ -60,6 +60,9 @@ class RandomTiDyOptics(DepthAugmentation):
           ``focus_distance``, ``aperture_diameter``, ``mask_jitter`` and ``switching_time`` cost more than ``exposure``
           and ``noise_level``.
         - Matrices of drawn lenses are remembered as those of other lenses are, in 256 MiB for each process at most.
+        - Behind a lens each image is a crop from a place that is drawn over the lens's field, as far out as its corners
+          allow, unless the camera's ``field_center`` or the geometry of a pipeline says the place. Each place takes
+          PSFs of its own, about a second; ``same_on_batch`` shares them.
         - Compiled graphs call it eagerly.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023, for the camera.
@@ -122,6 +125,9 @@ class RandomTiDyOptics(DepthAugmentation):
         """Return the draws of a batch: a value of each range and a seed for each image, (B,)."""
         params = super().generate_parameters(batch_shape)
         params["seed"] = row_seeds(batch_shape[0], self.same_on_batch)
+        if self.optics.lens is not None and self.optics.field_center == (0.0, 0.0):
+            reach = self.optics.lens.field / float(self.optics.camera.pixel_pitch)
+            params["field_center"] = row_places(batch_shape, reach, self.same_on_batch)
         return params
 
     def change(self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor]) -> Tensor:
@@ -137,10 +143,9 @@ class RandomTiDyOptics(DepthAugmentation):
         for drawn, rows in groups.items():
             camera = drawn_camera(self.optics, drawn)
             camera.sensor = RowSensors(self.optics.sensor, {name: value[rows] for name, value in params.items()})
-            whole = len(rows) == len(image)
-            parts.append(
-                camera(image if whole else image[rows], depth if whole or depth.shape[0] == 1 else depth[rows])
-            )
+            whole, place = len(rows) == len(image), params.get("field_center")
+            own = image if whole else image[rows], depth if whole or depth.shape[0] == 1 else depth[rows]
+            parts.append(camera(*own, field_center=None if place is None else place[rows]))
             order += rows
         coded = torch.cat(parts)
         return coded if len(groups) == 1 else coded[torch.tensor(order).argsort().to(coded.device)]

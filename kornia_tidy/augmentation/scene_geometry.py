@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, container_leaves, moves_pixels
 from kornia_tidy.checks import check_float_tensor, check_values
 from kornia_tidy.optics.holes import fill_holes
+from kornia_tidy.psf.field import check_centers
 
 KNOWN = (
     "IMAGE",
@@ -138,6 +139,45 @@ class SceneGeometry(nn.Module):
         whole = out.pop("image").to(image.dtype)
         scene = (whole, warped, seen) if batched else (whole[0], warped[0], seen[0])
         return Scene(*scene, out)
+
+    def field_center(self, before: Tensor, after: Tensor, center: Any = (0.0, 0.0)) -> Tensor:
+        """Return where the pictures of the last call lie, seen from the axis of the lens that is to take them.
+
+        A crop lies off the axis as far as its middle lies from that of the picture it was cut from. A flip, a rotation
+        or a change of size moves the place as it moves the picture about the axis.
+
+        Args:
+            before: the images that were given.
+            after: the images that came out.
+            center: where the middle of those that were given lies, (2,) or (B, 2): y and x in pixels.
+
+        Returns:
+            (B, 2) float64 on the CPU, y and x in pixels of the images that came out; (2,) for unbatched ones.
+
+        Raises:
+            ValueError: if a warp that moves parts of an image differently has no matrix.
+
+        Example:
+            >>> import kornia.augmentation as K
+            >>> geometry, image = SceneGeometry(K.CenterCrop(32)), torch.rand(2, 3, 64, 64)
+            >>> out = geometry(image, torch.ones(2, 1, 64, 64)).image
+            >>> geometry.field_center(image, out, (10.0, -20.0))
+            tensor([[ 10., -20.],
+                    [ 10., -20.]], dtype=torch.float64)
+        """
+        count = 1 if after.ndim == 3 else len(after)
+        places = torch.tensor(check_centers(center, count), dtype=torch.float64).expand(count, 2)
+        (rows, columns), (height, width) = before.shape[-2:], after.shape[-2:]
+        middle = torch.tensor([(rows - 1) / 2, (columns - 1) / 2], dtype=torch.float64)
+        axis = torch.cat([(middle - places).flip(1), torch.ones(count, 1, dtype=torch.float64)], 1)
+        matrix = self.container.transform_matrix
+        if matrix is None:
+            raise ValueError("the place of a picture in the field needs a warp with a matrix, got none")
+        moved = (matrix.detach().cpu().double() @ axis[..., None])[..., 0]
+        there = (moved[:, :2] / moved[:, 2:]).flip(1)
+        found = torch.tensor([(height - 1) / 2, (width - 1) / 2], dtype=torch.float64) - there
+        found = found.round(decimals=3)  # matrices are float32, and equal places have the same PSFs
+        return found[0] if after.ndim == 3 else found
 
     def _magnification(self) -> Tensor:
         """Return how much each image was enlarged, (B, 1, 1, 1)."""

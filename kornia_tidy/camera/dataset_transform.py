@@ -90,8 +90,9 @@ class DatasetTransform:
 
     def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
         """Return the sample with its image coded; arrays and PIL images are converted to tensors and back."""
-        options = {} if generator is None else {"generator": generator}
+        options: dict[str, Any] = {} if generator is None else {"generator": generator}
         if isinstance(sample, Mapping):
+            options |= {"field_center": sample["field_center"]} if "field_center" in sample else {}
             names = self._names(sample)
             image, depth = (sample[name] for name in names)
             plain = names[0] == "image" and names[1] in DEPTH_KEYS

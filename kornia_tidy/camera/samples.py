@@ -20,6 +20,7 @@ from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
+from kornia_tidy.psf.field import check_centers
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
 
@@ -63,6 +64,7 @@ class Sample:
         batched: whether image and depth came with the axis of batches.
         dtype: that the capture is computed in, float32 or float64.
         bytes_at_once: about as many as a capture of the whole image takes beyond image and capture.
+        centers: where the middles of the pictures lie from the lens's axis: one, one for each image, or none.
     """
 
     image: Tensor
@@ -71,6 +73,7 @@ class Sample:
     batched: bool
     dtype: torch.dtype
     bytes_at_once: int
+    centers: tuple[tuple[float, float], ...] = ()
 
     def coded(self, coded: Tensor) -> Any:
         """Return the capture in the sample's form.
@@ -131,7 +134,13 @@ def with_capture(
 
 
 def read_sample(
-    image: Any, depth: Any, camera: Watchful, generator: object = None, *, deferred: bool = False
+    image: Any,
+    depth: Any,
+    camera: Watchful,
+    generator: object = None,
+    *,
+    deferred: bool = False,
+    field_center: Any = None,
 ) -> Sample:
     """Return a sample given as tensors, a tuple or a mapping, with its types, shapes and light checked.
 
@@ -141,6 +150,7 @@ def read_sample(
         camera: says what it takes.
         generator: source of the noise, to be checked before any work.
         deferred: leave the light on an accelerator to :func:`survey_unread`.
+        field_center: where the middle of each picture lies. Default: the mapping's entry of this name, if it has one.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors, or the generator is none.
@@ -151,6 +161,7 @@ def read_sample(
     form = None
     if isinstance(image, Mapping):
         form = image
+        field_center = form.get("field_center") if field_center is None else field_center
         image, depth = _image_and_depth(image, depth)
     elif isinstance(image, (tuple, list)):
         if len(image) < 2 or depth is not None:
@@ -191,7 +202,8 @@ def read_sample(
             check_light(image, camera)
     wide = compute_dtype(image.dtype, model.fidelity, image.device) == torch.float64
     bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
-    sample = Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once)
+    centers = () if field_center is None else check_centers(field_center, len(image))
+    sample = Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once, centers)
     return filled_sample(sample) if camera.holes == "fill" and fills_holes(camera) else sample
 
 

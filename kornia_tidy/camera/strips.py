@@ -23,7 +23,7 @@ class Strip:
         border: what lies beyond the image: ``"valid"`` where it reaches as far as the PSFs.
         rows: of the capture. Default: all.
         reach: lowest and highest defocus of all rows, (2,). Default: to be found.
-        field: of the whole picture, behind a real lens, and where in it this image begins.
+        fields: of the whole picture, behind a real lens, and where in it this image begins: one, or one for each image.
     """
 
     image: Tensor
@@ -31,7 +31,16 @@ class Strip:
     border: str
     rows: slice | None = None
     reach: Tensor | None = None
-    field: Field | None = None
+    fields: tuple[Field, ...] = ()
+
+    def by_field(self) -> dict[Field | None, list[int]]:
+        """Return the images of the batch that lie at each place of the field; none of them: all."""
+        if len(self.fields) < 2:
+            return {self.fields[0] if self.fields else None: []}
+        places: dict[Field | None, list[int]] = {}
+        for i, field in enumerate(self.fields):
+            places.setdefault(field, []).append(i)
+        return places if len(places) > 1 else {self.fields[0]: []}
 
 
 def rows_at_once(sample: Sample, allowed: int) -> int | None:
@@ -50,7 +59,7 @@ def rows_at_once(sample: Sample, allowed: int) -> int | None:
 
 
 def strips_of(
-    sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor, field: Field | None
+    sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor, fields: tuple[Field, ...]
 ) -> Iterator[Strip]:
     """Yield the strips of a capture.
 
@@ -61,7 +70,7 @@ def strips_of(
         radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
         border: of the capture.
         reach: lowest and highest defocus, (2,).
-        field: of the picture, behind a real lens.
+        fields: of the pictures, behind a real lens.
     """
     sides = "replicate" if border == "zero" else border  # black has no depth of its own
     for top in range(0, height, rows):
@@ -69,8 +78,8 @@ def strips_of(
         image = padded_band(sample.image, own, radius, border).to(sample.dtype)
         depth = padded_band(sample.depth, own, radius, sides).to(sample.dtype)
         before = 0 if border == "valid" else radius
-        place = None if field is None else field.moved(top - before, -before)
-        yield Strip(image, depth, "valid", own, reach, place)
+        places = tuple(field.moved(top - before, -before) for field in fields)
+        yield Strip(image, depth, "valid", own, reach, places)
 
 
 def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:

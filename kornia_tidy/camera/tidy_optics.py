@@ -90,7 +90,8 @@ class TiDyOptics(CameraState):
             ``"double-gauss-50mm"``, made for the camera's aperture and focus. Its focal length, f-number and focus are
             the camera's. Each pixel sees the PSF of its place in the picture, within the fidelity's
             ``field_tolerance``; :meth:`psf_bank` gives those of single places. Default: an ideal lens.
-        field_center: where the middle of the pictures lies, y and x in sensor pixels from the lens's axis: of crops.
+        field_center: where the middle of the pictures lies, y and x in sensor pixels from the lens's axis: of crops. A
+            capture may bring its own: as an argument, or as an entry of a mapping.
 
     Shape:
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
@@ -220,6 +221,7 @@ class TiDyOptics(CameraState):
         depth: Tensor | None = None,
         params: Mapping[str, Tensor] | None = None,
         generator: torch.Generator | None = None,
+        field_center: Any = None,
     ) -> Any:
         """Take a picture of a sample given as tensors, a tuple or a mapping.
 
@@ -228,8 +230,11 @@ class TiDyOptics(CameraState):
             depth: the depth map, if ``image`` is a tensor.
             params: noise drawn before by :meth:`draw`, to repeat a capture or to compile one.
             generator: source of the noise (not while compiling).
+            field_center: where the middle of the picture lies from the lens's axis, (2,), or of each image, (B, 2): y
+                and x in sensor pixels. Default: the entry ``"field_center"`` of a mapping, else the camera's. Without a
+                lens it says nothing.
         """
-        sample, coded = read_sample(image, depth, self, generator, deferred=True), None
+        sample, coded = read_sample(image, depth, self, generator, deferred=True, field_center=field_center), None
         device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             for strip in self.strips(sample):  # one, of the whole picture, unless memory is short
@@ -251,8 +256,13 @@ class TiDyOptics(CameraState):
             scene = strip.image, strip.depth, defocus
             reach = survey_unread(*scene, self) if Mode.UNREAD in torch_mode() else survey_defocus([defocus], self)
         given = self.compositing, self.memory_budget, defocus, light.device
-        pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given, strip.field)
-        return render_pieces(light, defocus, pieces, self.rendering(light.device, strip.border))
+        parts, order = [], []
+        for field, items in strip.by_field().items():
+            own, deep = (light[items], defocus[items] if len(defocus) > 1 else defocus) if items else (light, defocus)
+            pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given, field)
+            parts.append(render_pieces(own, deep, pieces, self.rendering(light.device, strip.border)))
+            order += items
+        return torch.cat(parts)[torch.tensor(order).argsort().to(light.device)] if order else parts[0]
 
     def strips(self, sample: Sample) -> Iterator[Strip]:
         """Yield the strips that a picture is taken in: ordinarily one, which is all of it.
@@ -261,18 +271,18 @@ class TiDyOptics(CameraState):
             sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
         """
         rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
-        field, size = None, (sample.image.shape[-2], sample.image.shape[-1])
-        if self.lens is not None:
-            field = self.psf_model.field_of(size, self.field_center)
+        size = sample.image.shape[-2], sample.image.shape[-1]
+        found = [self.psf_model.field_of(size, center) for center in sample.centers or (self.field_center,)]
+        fields = tuple(field for field in found if field is not None)
         if rows is None:
-            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border, field=field)
+            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border, fields=fields)
             return
         check_border(self.border, *sample.image.shape[-2:], self.window)
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
         reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self)
-        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach, field)
+        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach, fields)
 
     def irradiance(self, sample: Sample) -> Tensor:
         """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""

@@ -124,6 +124,29 @@ def check_center(center: Any) -> tuple[float, float]:
     return y, x
 
 
+def check_centers(centers: Any, count: int) -> tuple[tuple[float, float], ...]:
+    """Return where the middles of a batch's pictures lie: one place for all of them, or one for each.
+
+    Args:
+        centers: (2,), or (B, 2) in any form.
+        count: B.
+
+    Raises:
+        TypeError: if they are not numbers.
+        ValueError: if they are not finite, or of another number.
+
+    Example:
+        >>> check_centers(torch.tensor([[3.0, 4.0], [0.0, 1.0]]), 2)
+        ((3.0, 4.0), (0.0, 1.0))
+    """
+    rows = centers.tolist() if hasattr(centers, "tolist") else centers
+    if not isinstance(rows, (tuple, list)) or not all(isinstance(row, (tuple, list)) for row in rows) or not rows:
+        return (check_center(rows),)
+    if len(rows) not in (1, count):
+        raise ValueError(f"field_center must be one place, or one for each of {count} images, got {len(rows)}")
+    return tuple(check_center(row) for row in rows)
+
+
 def chebyshev_points(count: int) -> list[float]:
     """Return the extrema of a Chebyshev polynomial, from -1 to 1; the middle for a single one.
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.augmentation import OpticsPipeline, RandomTiDyOptics, SceneGeometry
+from kornia_tidy.optics import Spectrum
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
 
@@ -23,6 +24,19 @@ def pipeline(**options: object) -> OpticsPipeline:
     return OpticsPipeline(
         **{"geometry": K.RandomHorizontalFlip(p=1.0), "optics": RandomTiDyOptics(camera(sensor=None), p=1.0), **options}
     )
+
+
+def lens_camera(**options: object) -> TiDyOptics:
+    masks = PixelwiseMask(2, generator=torch.Generator().manual_seed(3))
+    settings = Fidelity(window=17, layer_spacing=10.0, field_tolerance=1e-2)
+    given = {"spectrum": Spectrum.monochrome(), "color_space": "linear", "fidelity": settings, **options}
+    return TiDyOptics(masks, lens="single-50mm", **given)
+
+
+def lens_scene() -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    steps = torch.rand(1, 1, 10, 12, generator=generator).repeat_interleave(12, 2).repeat_interleave(12, 3)[..., :140]
+    return torch.rand(1, 1, 120, 140, generator=generator), 1 / (0.2 + 3 * steps)
 
 
 class TestOpticsPipeline(BaseTester):
@@ -145,3 +159,32 @@ class TestOpticsPipeline(BaseTester):
 
 def camera_of(chain: OpticsPipeline) -> TiDyOptics:
     return chain.optics.optics
+
+
+class TestBehindALens(BaseTester):
+    @pytest.mark.parametrize("random", [False, True])
+    @torch.no_grad()
+    def test_feature_a_crop_sees_what_the_whole_capture_has_there(self, random):
+        optics = lens_camera(field_center=(430.0, -500.0))
+        optics.sensor = None
+        whole = optics(*lens_scene())
+        geometry = K.RandomCrop((64, 64))
+        chain = OpticsPipeline(geometry, RandomTiDyOptics(optics, p=1.0) if random else optics)
+        torch.manual_seed(5)
+        image, depth = lens_scene()
+        out = chain({"image": image, "depth": depth, "field_center": torch.tensor([430.0, -500.0])})
+        top, left = (int(x) for x in chain.params["geometry"][0].data["src"][0, 0].flip(0))
+        expected = whole[..., top : top + 64, left : left + 64]
+        inner = slice(9, -9)  # where the window does not reach beyond the crop
+        self.assert_close(out["image"][..., inner, inner], expected[..., inner, inner], rtol=0, atol=2e-3)
+        place = torch.tensor([[430.0 + top + 31.5 - 59.5, -500.0 + left + 31.5 - 69.5]]).double()
+        self.assert_close(out["field_center"], place, rtol=0, atol=1e-3)
+        axis = optics(out["all_in_focus"], out["depth"], field_center=(0.0, 0.0))
+        error = (axis - out["image"])[..., inner, inner].abs().max()
+        assert float(error) > 0.02  # ten times the bound above
+        again = chain(image, depth, params=chain.params)[0]
+        assert torch.equal(again, out["image"])
+
+    def test_feature_without_a_lens_nothing_is_told(self):
+        image, depth = scene(1)
+        assert set(pipeline()({"image": image, "depth": depth})) == {"image", "depth", "all_in_focus"}

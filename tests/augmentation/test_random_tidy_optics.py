@@ -8,6 +8,7 @@ import torch
 
 from kornia_tidy import (
     DefocusRange,
+    Fidelity,
     PixelwiseMask,
     SensorNoise,
     SpatialLightModulator,
@@ -234,3 +235,39 @@ class TestRandomTiDyOptics(BaseTester):
         params = optics.forward_parameters(image.shape)
         compiled = torch.compile(optics, backend="eager")
         self.assert_close(compiled(image, depth, params=params), optics(image, depth, params=params))
+
+
+class TestBehindALens(BaseTester):
+    def augmentation(self, **options) -> RandomTiDyOptics:
+        masks = PixelwiseMask(1, generator=torch.Generator().manual_seed(3))
+        fast = Fidelity(window=9, layer_spacing=20.0, field_tolerance=0.3)
+        optics = TiDyOptics(masks, lens="single-50mm", fidelity=fast, sensor=None, **options)
+        return RandomTiDyOptics(optics, p=1.0)
+
+    @torch.no_grad()
+    def test_feature_places_are_drawn_over_the_field_and_repeated(self):
+        augmentation, (image, depth) = self.augmentation(), scene(3)
+        torch.manual_seed(2)
+        coded = augmentation(image, depth)
+        places = augmentation._params["field_center"]
+        reach = augmentation.optics.lens.field / 8e-6
+        corners = places.norm(dim=1) + math.hypot(*image.shape[-2:]) / 2
+        assert places.shape == (3, 2)
+        assert bool((corners <= reach).all())
+        assert len({tuple(place) for place in places.tolist()}) == 3
+        expected = augmentation.optics(image, depth, field_center=places)
+        assert torch.equal(coded, expected)
+        assert torch.equal(augmentation(image, depth, params=augmentation._params), coded)
+        assert not torch.equal(augmentation(image, depth), coded)
+
+    def test_feature_a_place_that_the_camera_says_stays(self):
+        augmentation, (image, depth) = self.augmentation(field_center=(300.0, 0.0)), scene(2)
+        coded = augmentation(image, depth)
+        assert "field_center" not in augmentation._params
+        assert torch.equal(coded, augmentation.optics(image, depth))
+
+    @torch.no_grad()
+    def test_feature_one_place_for_the_batch(self):
+        augmentation = RandomTiDyOptics(self.augmentation().optics, p=1.0, same_on_batch=True)
+        drawn = augmentation.forward_parameters((3, 3, 40, 40))["field_center"]
+        assert torch.equal(drawn, drawn[:1].expand(3, 2))

@@ -28,6 +28,39 @@ class TestSceneGeometry(BaseTester):
         assert out.image.shape == (*lead, 3, 32, 36)
         assert out.depth.shape == out.valid.shape == (*lead, 1, 32, 36)
 
+    @pytest.mark.parametrize(
+        "augmentations",
+        [
+            [K.RandomCrop((32, 41))],
+            [K.RandomCrop((32, 41), cropping_mode="resample"), K.RandomHorizontalFlip(p=1.0)],
+            [K.RandomVerticalFlip(p=0.5), K.RandomCrop((32, 41))],
+            [K.RandomCrop((100, 140), pad_if_needed=True)],
+            [K.RandomResizedCrop((32, 41))],
+            [K.RandomCrop((32, 41)), K.Resize((64, 82))],
+            [K.RandomAffine(20, (0.1, 0.1), (0.8, 1.2), p=1.0)],
+        ],
+    )
+    def test_feature_crops_lie_in_the_field_where_their_content_says(self, augmentations):
+        """The image holds its own coordinates from the axis; in the crop they grow by those of a pixel."""
+        y, x = torch.meshgrid(torch.arange(90.0), torch.arange(121.0), indexing="ij")
+        image = torch.stack([y - 44.5 + 7, x - 60 - 20]).expand(3, 2, 90, 121)
+        geometry = SceneGeometry(*augmentations)
+        torch.manual_seed(1)
+        out = geometry(image, torch.ones(3, 1, 90, 121)).image
+        found = geometry.field_center(image, out, (7.0, -20.0))
+        row, column = ((side - 1) // 2 for side in out.shape[-2:])
+        here = out[..., row, column]
+        steps = torch.stack([out[..., row + 1, column] - here, out[..., row, column + 1] - here], -1)
+        offset = torch.tensor([(side - 1) / 2 - (side - 1) // 2 for side in out.shape[-2:]])
+        expected = torch.linalg.solve(steps, here[..., None])[..., 0] + offset
+        self.assert_close(found.float(), expected, rtol=0, atol=2e-2)
+
+    def test_exception_a_place_that_is_none(self):
+        geometry, image = SceneGeometry(K.CenterCrop(8)), torch.rand(1, 3, 16, 16)
+        out = geometry(image, torch.ones(1, 1, 16, 16)).image
+        with pytest.raises(TypeError, match="field_center must be two numbers"):
+            geometry.field_center(image, out, 5.0)
+
     def test_feature_a_flip_moves_image_depth_and_mask_alike(self):
         image, depth = scene(2)
         valid = depth > 1

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.camera import camera_of_state
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
@@ -145,6 +145,43 @@ class TestLensCaptures(BaseTester):
         optics.field_center = (450.0 + 20, 520.0 + 30)
         part = optics(image[..., 40:, 60:], depth[..., 40:, 60:])
         self.assert_close(part, whole[..., 40:, 60:], rtol=0, atol=1e-3)
+
+    @pytest.mark.parametrize("form", ["argument", "mapping", "strips", "dataset"])
+    @torch.no_grad()
+    def test_feature_each_image_of_a_batch_has_its_place(self, form):
+        scenes, places = [scene(136, 40, seed) for seed in range(3)], [(450.0, 520.0), (0.0, -20.0), (450.0, 520.0)]
+        alone = [camera(center=center)(*one) for one, center in zip(scenes, places, strict=True)]
+        optics = camera(center=(0.0, 0.0))
+        image, depth = (torch.cat(parts) for parts in zip(*scenes, strict=True))
+        if form == "strips":
+            optics.memory_budget = 1
+        if form in ("argument", "strips"):
+            seen = optics(image, depth, field_center=torch.tensor(places))
+        elif form == "mapping":
+            seen = optics({"image": image, "depth": depth, "field_center": torch.tensor(places)})["image"]
+        else:
+            transform = optics.as_transform()
+            given = zip(image, depth, torch.tensor(places), strict=True)
+            samples = [{"image": x, "depth": d[0].numpy(), "field_center": c} for x, d, c in given]
+            seen = torch.stack([transform(sample)["image"] for sample in samples])
+        self.assert_close(seen, torch.cat(alone), rtol=0, atol=1e-5)
+        assert float((alone[0] - optics(*scenes[0])).abs().max()) > 0.02
+
+    @torch.no_grad()
+    def test_feature_noise_does_not_depend_on_whether_places_differ(self):
+        optics = camera(center=(9.0, 9.0))
+        optics.sensor = SensorNoise(0.01)
+        image, depth = (torch.cat([part, part]) for part in scene(24, 24))
+        one, other = (
+            optics(image, depth, field_center=center, generator=torch.Generator().manual_seed(1))
+            for center in (None, [(9.0, 9.0), (9.0, 9.01)])
+        )
+        self.assert_close(one, other, rtol=0, atol=1e-5)
+
+    def test_gradcheck_of_places(self):
+        optics = camera(fidelity=SETTINGS.replace(double=True))
+        image, depth = (torch.cat([part, part]).double() for part in scene(9, 9))
+        self.gradcheck(lambda x: optics(x, depth, field_center=[(400.0, 500.0), (0.0, 0.0)]), (image,))
 
     @torch.no_grad()
     def test_smoke_colours_states_spectra_and_veils(self):
@@ -282,6 +319,21 @@ class TestLensCaptures(BaseTester):
         optics.field_center = center
         with pytest.raises(error, match=message):
             optics(image, depth)
+
+    @pytest.mark.parametrize(
+        ("center", "error", "message"),
+        [
+            ([(0.0, 0.0)] * 3, ValueError, "field_center must be one place, or one for each of 2 images, got 3"),
+            ([(0.0, 0.0), (math.inf, 0.0)], ValueError, "field_center must be finite, got"),
+            ([(0.0, 0.0), (1.0,)], TypeError, "field_center must be two numbers, y and x in sensor pixels, got a list"),
+            ([], TypeError, "field_center must be two numbers"),
+            ("corner", TypeError, "field_center must be two numbers, .* got 'corner'"),
+        ],
+    )
+    def test_exception_places_of_a_batch(self, center, error, message):
+        image, depth = (torch.cat([part, part]) for part in scene(24, 24))
+        with pytest.raises(error, match=message):
+            camera()(image, depth, field_center=[list(c) for c in center] if isinstance(center, list) else center)
 
     def test_exception_compiling(self):
         optics, (image, depth) = camera(), scene(24, 24)
