@@ -166,6 +166,14 @@ def _stop_points(
         return points, zernike_polynomials((degree + 1) * (degree + 2) // 2, points.y, points.x)
 
 
+@lru_cache(maxsize=32)
+def _places_of_modes(count: int, sines: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the azimuthal orders of polynomials of one parity, and where they and their mirrors stand among all."""
+    with torch.inference_mode(False):
+        n, m = torch.tensor(modes_of(count, sines=sines)).T
+        return m.double(), (n * (n + 2) + m) // 2, (n * (n + 2) - m) // 2
+
+
 class TurnedLens:
     """A lens at one field point of a sample, in the coordinates of the mask and of the sensor."""
 
@@ -183,12 +191,11 @@ class TurnedLens:
     def _turned(self, coefficients: Tensor, *, sines: bool) -> Tensor:
         """Return coefficients of all polynomials for the field's azimuth, from those for a field along +x."""
         whole = coefficients.new_zeros(*coefficients.shape[:-1], (self.degree + 1) * (self.degree + 2) // 2)
-        for index, (n, m) in enumerate(modes_of(coefficients.shape[-1], sines=sines)):
-            cosine, sine = math.cos(m * self.azimuth), math.sin(m * self.azimuth)
-            value, first = coefficients[..., index], n * (n + 2)
-            whole[..., (first + m) // 2] += value * (-sine if sines else cosine)
-            if m:
-                whole[..., (first - m) // 2] += value * (cosine if sines else sine)
+        orders, even, odd = _places_of_modes(coefficients.shape[-1], sines)
+        cosine, sine = torch.cos(orders * self.azimuth), torch.sin(orders * self.azimuth)
+        whole[..., even] = coefficients * (-sine if sines else cosine)
+        turning = orders > 0
+        whole[..., odd[turning]] = (coefficients * (cosine if sines else sine))[..., turning]
         return whole
 
     def _values(self, name: str, polynomials: Tensor) -> Tensor:

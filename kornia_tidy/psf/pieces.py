@@ -31,6 +31,7 @@ from kornia_tidy.psf.wide_psfs import held_nodes
 
 LEAST_BYTES = 12 << 20  # allowed to a piece whatever the budget
 _COPIES = 4  # of PSFs, while a bank is computed, stacked and normalised
+_FIELD_COPIES = 3  # of PSFs over the field: by their defocus, as a bank, and with their light
 _TILE = 4  # side of the tiles' transforms over that of the PSFs: with smaller tiles their overlap is most of them
 _POINTS = 100  # bytes for each pixel along a PSF's side and each mask pixel: the matrices of the propagation
 _MOST_COPIES = 64  # of PSFs: while they are computed, and in their spectra, for each state
@@ -188,7 +189,7 @@ def _most_layers(
     if fidelity.layers not in ("nearest", "linear") or (layers := len(nodes_around(model.defocus_nodes, reach))) < 3:
         return whole
     psfs, work = layer_bytes(model, channels, dtype)
-    psfs *= points
+    psfs = psfs if points == 1 else psfs * points * _FIELD_COPIES // _COPIES
     allowed = max(budget // 2, LEAST_BYTES)
     if compositing == "occlusion":
         states = len(model.state_weights(dtype)) if fidelity.occlusion_states == "each" else 1
