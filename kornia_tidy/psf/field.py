@@ -30,7 +30,7 @@ class Field:
         center: of the picture, y and x from the lens's axis.
         origin: row and column in the picture of the first pixel of the light that is rendered: negative where a border
             was added, and above zero in a lower strip.
-        cell: side in pixels of the cells in which PSFs are taken to first order about the middle.
+        cell: side in pixels of the largest cells in which PSFs are taken to first order about the middle.
 
     Convention:
         - The middle of the picture is at ``(size - 1) / 2``. PSFs beyond the picture, as of a border, are those of the
@@ -63,23 +63,27 @@ class Field:
         """Return the field for light that begins so many rows and columns further."""
         return replace(self, origin=(self.origin[0] + rows, self.origin[1] + columns))
 
-    def along(self, axis: int, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the weights of the nodes along an axis at some pixels of the picture, and their slopes for a pixel.
+    def along(self, axis: int, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the weights of the nodes along an axis at some pixels, with first and second derivatives for a pixel.
 
         Args:
             axis: 0 for rows, 1 for columns.
             pixels: (n,) row or column in the picture.
 
         Returns:
-            (n, nodes) each, float64; weights sum to one, slopes to zero, which they are beyond the picture.
+            (n, nodes) each, float64; weights sum to one, derivatives to zero, which they are beyond the picture.
         """
         half = (self.size[axis] - 1) / 2
         places = (pixels.double() - half) / max(half, 0.5)
-        weights, slopes = lagrange(self.nodes[axis], places.clamp(-1, 1))
-        return weights, slopes / max(half, 0.5) * (places.abs() <= 1)[:, None]
+        weights, slopes, bends = lagrange(self.nodes[axis], places.clamp(-1, 1))
+        inside = (places.abs() <= 1)[:, None] / max(half, 0.5)
+        return weights, slopes * inside, bends * inside**2
 
     def tiles(self, axis: int, first: int, pixels: int, most: int, beyond: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the tiles along an axis of a part of the picture: as large as possible, and alike in any part.
+        r"""Return the tiles along an axis of a part of the picture: as large as possible, and alike in any part.
+
+        A tile of n pixels takes for its middle :math:`h + h'' (n^2 - 1) / 24`, so that its first order is right on
+        average.
 
         Args:
             axis: 0 for rows, 1 for columns.
@@ -90,7 +94,7 @@ class Field:
 
         Returns:
             Where in the part tiles begin, and its end, (n + 1,) int64; the middles of the picture's tiles, counted from
-            the part's first pixel, (n,) float64; the nodes' weights there, and their slopes, (n, 2, nodes).
+            the part's first pixel, (n,) float64; the nodes' weights of the first order there, (n, 2, nodes).
 
         Example:
             >>> edges, middles, weights = Field((1, 90), (1, 2)).tiles(1, 20, 60, 40)
@@ -103,7 +107,8 @@ class Field:
         starts = torch.arange(begin, end + 1) * side - beyond
         middles = starts.double() + (side - 1) / 2
         edges = torch.cat([(starts - first).clamp(min=0), torch.tensor([pixels])])
-        return edges, middles - first, torch.stack(self.along(axis, middles), 1)
+        weights, slopes, bends = self.along(axis, middles)
+        return edges, middles - first, torch.stack([weights + bends * (side**2 - 1) / 24, slopes], 1)
 
 
 def check_center(center: Any) -> tuple[float, float]:
@@ -157,27 +162,28 @@ def chebyshev_points(count: int) -> list[float]:
     return [math.sin(math.pi * (2 * i - count + 1) / (2 * max(count - 1, 1))) for i in range(count)]
 
 
-def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor]:
-    """Return values and slopes of the Lagrange polynomials of the Chebyshev points, (n, count) float64 each.
+def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Lagrange polynomials of the Chebyshev points and two derivatives, (n, count) float64 each.
 
     Args:
         count: of the points.
         places: (n,) from -1 to 1.
 
     Example:
-        >>> values, slopes = lagrange(2, torch.tensor([0.5]))
-        >>> values.tolist(), slopes.tolist()
-        ([[0.25, 0.75]], [[-0.5, 0.5]])
+        >>> values, slopes, bends = lagrange(2, torch.tensor([0.5]))
+        >>> values.tolist(), slopes.tolist(), bends.tolist()
+        ([[0.25, 0.75]], [[-0.5, 0.5]], [[0.0, 0.0]])
     """
-    series, derived = _series(count)
+    value, first, second = _series(count)
     at = torch.from_numpy(np.polynomial.chebyshev.chebvander(places.double().cpu().numpy(), max(count - 1, 1)))
-    return at[:, :count] @ series, at[:, : len(derived)] @ derived
+    return at[:, :count] @ value, at[:, : len(first)] @ first, at[:, : len(second)] @ second
 
 
 @lru_cache(maxsize=32)
-def _series(count: int) -> tuple[Tensor, Tensor]:
-    """Return the Chebyshev series of the Lagrange polynomials and of their slopes, a column for each."""
+def _series(count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the Chebyshev series of the Lagrange polynomials and of two derivatives, a column for each."""
     with torch.inference_mode(False):
         polynomials = np.polynomial.chebyshev
         series = np.linalg.inv(polynomials.chebvander(chebyshev_points(count), count - 1))
-        return torch.from_numpy(series), torch.from_numpy(polynomials.chebder(series, axis=0))
+        value, first, second = (torch.from_numpy(polynomials.chebder(series, n, axis=0)) for n in range(3))
+        return value, first, second

@@ -25,7 +25,7 @@ from kornia_tidy.psf.field import Field, chebyshev_points, lagrange
 from kornia_tidy.psf.lens_psfs import turned_lenses
 
 MOST_NODES = 13  # along a side
-CELLS = (128, 96, 64, 48, 32, 16)  # px along the side of a cell that sees the change of PSFs to first order
+CELLS = (16, 128)  # px along the side of the smallest and largest cell that sees PSFs change to first order
 _KNOWN = 15  # Chebyshev points along a line at which phases are computed
 _RINGS = ((0.0, 1), (0.5, 4), (0.9, 8))  # radius in the stop, and points there
 
@@ -57,11 +57,11 @@ def field_nodes(
         >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2)
         >>> whole = field_nodes((1110, 1282), (0.0, 0.0), lens, *given)
         >>> whole.nodes, whole.cell
-        ((7, 8), 96)
+        ((7, 8), 128)
         >>> field_nodes((64, 64), (0.0, 0.0), lens, *given).nodes
         (1, 1)
     """
-    found, cell, beyond = [], CELLS[0], 0.0
+    found, cell, beyond = [], CELLS[1], 0.0
     for axis in (0, 1):
         half = (size[axis] - 1) / 2
         errors = torch.zeros(MOST_NODES + 1, dtype=torch.float64)
@@ -72,8 +72,8 @@ def field_nodes(
             phases = _phases(lens, places, defocus, wavelength, pixel_pitch, reach)
             of_nodes, bend = _errors(phases)
             errors = torch.maximum(errors, of_nodes)
-            bent = [bend * (side / max(2 * half, 1)) ** 2 for side in CELLS]
-            cell = min(cell, next((side for side, b in zip(CELLS, bent, strict=True) if b <= tolerance), CELLS[-1]))
+            fitting = 2 * half * math.sqrt(tolerance / bend) if bend > 0 else math.inf
+            cell = max(CELLS[0], int(min(cell, fitting)))
         enough = (errors[1:] <= tolerance).nonzero()
         beyond = max(beyond, 0.0 if len(enough) else float(errors[-1]))
         found.append(int(enough[0]) + 1 if len(enough) else MOST_NODES)
@@ -91,7 +91,7 @@ def field_nodes(
 def _errors(phases: Tensor) -> tuple[Tensor, float]:
     """Return the error of the factors of all pairs for each number of nodes, the first entry standing for none.
 
-    And that of their first order about the middle of a cell as long as the line, were it to follow the second order.
+    And that of their first order in a cell as long as the line, were it to follow the second order.
     """
     fine = torch.linspace(-1, 1, 4 * _KNOWN, dtype=torch.float64)
 
@@ -104,8 +104,8 @@ def _errors(phases: Tensor) -> tuple[Tensor, float]:
         nodes = factors(torch.tensor(chebyshev_points(count), dtype=torch.float64))
         between = torch.tensordot(lagrange(count, fine)[0].to(nodes.dtype), nodes, 1)
         errors.append(float((between - exact).abs().square().mean(-1).sqrt().max()))
-    second = exact.diff(n=2, dim=0) / float(fine[1] - fine[0]) ** 2  # f'' x^2 / 2, and x^4 is 1 / 5 on average
-    bend = float(second.abs().square().mean(-1).sqrt().max()) / (2 * math.sqrt(5))
+    second = exact.diff(n=2, dim=0) / float(fine[1] - fine[0]) ** 2  # f'' (x^2 - 1 / 3) / 2 is left, see Field.tiles
+    bend = float(second.abs().square().mean(-1).sqrt().max()) / math.sqrt(45)
     return torch.tensor(errors, dtype=torch.float64), bend
 
 
