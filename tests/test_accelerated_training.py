@@ -170,7 +170,7 @@ class TestFastBlocks(BaseTester):
 
         torch.manual_seed(0)
         network = NAFNet(26, 3, width=16).to("cuda", memory_format=torch.channels_last)
-        network.looked = True
+        network.range_checked = True
         for value in network.parameters():  # blocks are the identity at first
             torch.nn.init.normal_(value, std=0.2) if value.shape[0] == 1 else None
         maps = torch.rand(1, 26, 16, 32, device="cuda")

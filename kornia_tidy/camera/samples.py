@@ -19,7 +19,7 @@ from kornia_tidy.kernels.precision import widest
 from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
-from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, tell_once
+from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, warn_once
 from kornia_tidy.psf.field import check_centers
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
@@ -42,7 +42,7 @@ class Notes:
     clamped: Tensor | int = 0
 
 
-class Watchful(Protocol):
+class CheckedCamera(Protocol):
     """A camera that checks its inputs and warns once."""
 
     psf_model: PSFModel
@@ -136,7 +136,7 @@ def with_capture(
 def read_sample(
     image: Any,
     depth: Any,
-    camera: Watchful,
+    camera: CheckedCamera,
     generator: object = None,
     *,
     deferred: bool = False,
@@ -149,7 +149,7 @@ def read_sample(
         depth: the depth map, if ``image`` is a tensor.
         camera: says what it takes.
         generator: source of the noise, to be checked before any work.
-        deferred: leave the light on an accelerator to :func:`survey_unread`.
+        deferred: leave the light on an accelerator to :func:`defocus_extremes_in_one_read`.
         field_center: where the middle of each picture lies. Default: the mapping's entry of this name, if it has one.
 
     Raises:
@@ -222,7 +222,7 @@ def compute_dtype(dtype: torch.dtype, fidelity: Fidelity, device: torch.device) 
     return widest(device) if wide else torch.float32
 
 
-def check_light(image: Tensor, camera: Watchful) -> None:
+def check_light(image: Tensor, camera: CheckedCamera) -> None:
     """Raise an error for an image that is not light, and warn once of one that seems to be in another unit.
 
     Args:
@@ -235,7 +235,7 @@ def check_light(image: Tensor, camera: Watchful) -> None:
     if camera.check_inputs and Mode.GRAPH not in torch_mode():
         said = check_image(image, encoded=camera.color_space != "linear")
         if said is not None:
-            tell_once(camera.notes.told, "image", said, stacklevel=7)
+            warn_once(camera.notes.told, "image", said, stacklevel=7)
 
 
 def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
@@ -251,7 +251,7 @@ def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
     return sample["image"], sample[keys[0]]
 
 
-def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> Tensor:
+def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera) -> Tensor:
     """Return how far the defocus of a scene reaches; note and, once, tell of pixels beyond the camera's range.
 
     Args:
@@ -282,13 +282,13 @@ def survey_defocus(parts: Iterable[Tensor], camera: Watchful) -> Tensor:
         pixels += own.numel()
     camera.notes.clamped = clamped
     if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
-        tell_of_defocus(extremes, camera, pixels, int(clamped))
+        warn_of_defocus(extremes, camera, pixels, int(clamped))
     if fixed is not None:
         return torch.tensor(fixed, requires_grad=reach is not None and reach.requires_grad)
     return extremes if reach is None else reach
 
 
-def survey_unread(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
+def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
     """Return how far the defocus of a scene on an accelerator reaches, and check the scene and the masks.
 
     The host waits for an accelerator once, for the extremes of image, depth, defocus and masks together, and not at all
@@ -326,11 +326,11 @@ def survey_unread(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) ->
             lens.defocus(depth)
         beyond = reach[0] < lo - ROUNDING or reach[1] > hi + ROUNDING
         if beyond or reach[1] <= lo + SAME_FOCUS:
-            tell_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)
+            warn_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)
     return torch.tensor(reach, requires_grad=defocus.requires_grad)
 
 
-def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped: int = 0) -> None:
+def warn_of_defocus(extremes: Tensor, camera: CheckedCamera, pixels: int = 0, clamped: int = 0) -> None:
     """Warn once of depths in another unit, or else of those beyond the camera's range.
 
     Args:
@@ -342,10 +342,10 @@ def tell_of_defocus(extremes: Tensor, camera: Watchful, pixels: int = 0, clamped
     lens = camera.psf_model.camera
     said = misread_depth(lens, *extremes)
     if said is not None:
-        tell_once(camera.notes.told, "depth", said, stacklevel=8)
+        warn_once(camera.notes.told, "depth", said, stacklevel=8)
     elif clamped:
         (lo, hi), (lowest, highest) = lens.defocus_range, extremes.tolist()
-        tell_once(
+        warn_once(
             camera.notes.told,
             "depths beyond the camera's range",
             f"{clamped} of {pixels} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "

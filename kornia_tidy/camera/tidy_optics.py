@@ -17,10 +17,10 @@ from kornia_tidy.camera.samples import (
     Sample,
     check_light,
     compute_dtype,
+    defocus_extremes,
+    defocus_extremes_in_one_read,
     read_sample,
-    survey_defocus,
-    survey_unread,
-    tell_of_defocus,
+    warn_of_defocus,
 )
 from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
@@ -254,7 +254,11 @@ class TiDyOptics(CameraState):
         """
         if (reach := strip.reach) is None:
             scene = strip.image, strip.depth, defocus
-            reach = survey_unread(*scene, self) if Mode.UNREAD in torch_mode() else survey_defocus([defocus], self)
+            reach = (
+                defocus_extremes_in_one_read(*scene, self)
+                if Mode.UNREAD in torch_mode()
+                else defocus_extremes([defocus], self)
+            )
         given = self.compositing, self.memory_budget, defocus, light.device
         parts, order = [], []
         for field, items in strip.by_field().items():
@@ -281,7 +285,7 @@ class TiDyOptics(CameraState):
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
-        reach = survey_defocus((self.defocus(part.to(sample.dtype)) for part in parts), self)
+        reach = defocus_extremes((self.defocus(part.to(sample.dtype)) for part in parts), self)
         yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach, fields)
 
     def irradiance(self, sample: Sample) -> Tensor:
@@ -438,7 +442,7 @@ class TiDyOptics(CameraState):
         if len(sample.image) == 0:
             raise ValueError("an explanation needs at least one image, got a batch of none")
         light, defocus = self.decode(sample.image.to(sample.dtype)), self.defocus(sample.depth.to(sample.dtype))
-        reach, (batch, channels, height, width) = survey_defocus([defocus], self), light.shape
+        reach, (batch, channels, height, width) = defocus_extremes([defocus], self), light.shape
         given = self.compositing, self.memory_budget, defocus
         pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
         if pieces[0].window is not None:
@@ -486,7 +490,7 @@ class TiDyOptics(CameraState):
         sample = read_sample(image, depth, self)
         defocus = self.defocus(sample.depth.to(sample.dtype)).detach()
         if self.check_inputs:
-            tell_of_defocus(torch.stack(torch.aminmax(defocus)), self)
+            warn_of_defocus(torch.stack(torch.aminmax(defocus)), self)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""

@@ -21,7 +21,7 @@ from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.optics.units import check_depth_scale, tell_once
+from kornia_tidy.optics.units import check_depth_scale, warn_once
 
 UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
@@ -135,7 +135,7 @@ def read_depth(
 def _tell_of_scale(path: str | os.PathLike[str], of_file: float, scale: float) -> None:
     """Warn once per folder of a file that gives another factor for its numbers than the caller."""
     if not math.isclose(of_file, 1) and not math.isclose(of_file, scale, rel_tol=1e-6):
-        tell_once(
+        warn_once(
             None,
             ("scale", Path(path).parent),
             f"{path} says that its numbers are to be multiplied by {of_file:.9g}, and scale is {scale:.9g}: if that "
@@ -154,7 +154,7 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
         others = float(stored[~full & np.isfinite(stored)].max(initial=0))
         # It is a depth if other depths reach up to it, or if write_depth wrote the file.
         if others < 0.9 * mark and b"tEXtdepth_scale\0" not in path.read_bytes()[:1024]:
-            tell_once(
+            warn_once(
                 None,
                 (mark, path.parent),
                 f"{path} holds {mark} where its other values end at {others:g}, and it is taken for a depth: if it "
@@ -167,7 +167,7 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
         holes = endless & np.maximum.accumulate(~endless, axis=0)
         known = stored[np.isfinite(stored)]
         if 2 * holes.sum() > endless.sum() and np.median(known) > NEAR_DISPARITY:
-            tell_once(
+            warn_once(
                 None,
                 ("inf", path.parent),
                 f"{path} holds infinity, which is taken for a depth in metres: if it is a disparity, as Middlebury's, "

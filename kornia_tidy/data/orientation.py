@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from kornia_tidy.data.picture_header import JPEG, PNG, jpeg_segments, png_chunks
-from kornia_tidy.optics.units import tell_once
+from kornia_tidy.optics.units import warn_once
 
 STORED = {
     2: ("mirrored left to right", "depth[:, ::-1]"),
@@ -71,7 +71,7 @@ def tell_orientation(
     if orientation in STORED:
         path = Path(path)
         key = ("orientation", path.parent, path.suffix, size, orientation, of)
-        tell_once(None, key, told(path, orientation, of), stacklevel=4)
+        warn_once(None, key, told(path, orientation, of), stacklevel=4)
 
 
 def told(path: str | os.PathLike[str], orientation: int, of: Literal["picture", "depth"] = "picture") -> str:

@@ -29,7 +29,7 @@ FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of sev
 _TOLD: set[Hashable] = set()  # warnings that were given in this process
 
 
-def tell_once(told: set[Hashable] | None, key: Hashable, sentence: str, stacklevel: int = 3) -> None:
+def warn_once(told: set[Hashable] | None, key: Hashable, sentence: str, stacklevel: int = 3) -> None:
     """Give a warning the first time that its key occurs.
 
     Args:

@@ -54,7 +54,7 @@ MOST_PICTURES = 3  # the same, whose PSFs are: some 70 MB each, for 65 px and 72
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
-class Derived:
+class CachedParts:
     """What follows from the parts of a PSF model and is found when it is first asked for: window, pupil, wide blur."""
 
     def __init__(self, window: FittedWindow | None = None) -> None:
@@ -115,7 +115,7 @@ class PSFModel:
     measured_cut: bool  # whether measured PSFs are zero somewhere
 
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
-    _derived: Derived
+    _derived: CachedParts
     _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
     # For each moment and state, for their averages, for each number of threads, grid and points of the field; None
     # remembers no PSFs.
@@ -190,7 +190,7 @@ class PSFModel:
             parts["lens"] = fitting_lens(*given)
             if isinstance(present["aperture"], (nn.Parameter, LearnableAperture)):
                 raise ValueError("a learnable aperture needs an ideal lens, got a lens with a stop of its own")
-        return self._replace(_derived=Derived(), **parts)
+        return self._replace(_derived=CachedParts(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
         """Return a model with other fields. What is not replaced is shared: parts and remembered PSFs."""
@@ -584,7 +584,7 @@ class PSFModel:
         count = len(self.state_weights(torch.float32))
         if not 0 <= state < count:
             raise ValueError(f"state must be from 0 to {count - 1}, got {state}")
-        return self.of_state(state)._replace(_derived=Derived(self.fitted))
+        return self.of_state(state)._replace(_derived=CachedParts(self.fitted))
 
     def of_state(self, state: int) -> Self:
         """Return this model with one state, unchecked, and what was found for all of them, such as wide blur."""
@@ -610,7 +610,7 @@ class PSFModel:
         count = len(self.timeline(torch.float32).durations)
         if not 0 <= moment < count:
             raise ValueError(f"moment must be from 0 to {count - 1}, got {moment}")
-        return self._replace(moment=moment, _derived=Derived(self.fitted))
+        return self._replace(moment=moment, _derived=CachedParts(self.fitted))
 
     def with_bank(self, bank: PSFBank) -> Self:
         """Return this model with PSFs that were measured in the place of its masks'. The other parts are shared.
@@ -640,7 +640,7 @@ class PSFModel:
                 f"{self.fixed_window} px; set Fidelity.window, or take its settings over by "
                 f"load_state_dict(state, take_over=True)"
             )
-        return self._replace(_derived=Derived(window))
+        return self._replace(_derived=CachedParts(window))
 
     # ------------------------------------------------------------------ what follows from the parts
 

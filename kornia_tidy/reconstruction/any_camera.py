@@ -61,7 +61,7 @@ class AnyCameraHead(ClosedFormHead):
         network = NAFNet(closed_form_channels(layers) + CAMERA_MAPS, 4, width, repeats)
         nn.init.zeros_(network.last.weight)
         network.last.bias = nn.Parameter(torch.tensor([SHARE, 0.0, 0.0, 0.0]))
-        network.looked = True  # no check of the range, as maps leave [0, 1]
+        network.range_checked = True  # no check of the range, as maps leave [0, 1]
         self.network: NAFNet = network
         self.stride = network.stride
 

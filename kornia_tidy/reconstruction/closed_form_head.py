@@ -84,7 +84,7 @@ class ClosedFormHead(ReconstructionHead):
                 raise ValueError(f"the network must take {wanted} channels, got in_channels={network.in_channels}")
             if network.out_channels >= 3:
                 zero_last_convolution(network, 3)
-            network.looked = True  # no check of the range, as refocused maps leave [0, 1]
+            network.range_checked = True  # no check of the range, as refocused maps leave [0, 1]
 
     def forward(self, image: Tensor, noise: Tensor | float | None = None) -> Tensor:
         """Return the estimated maps, (B, out_channels, H, W)."""

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 
-def give_back() -> None:
+def release_freed_memory() -> None:
     """Give memory that was freed back to the system, where the C library is GNU's; elsewhere nothing happens.
 
     That library keeps blocks of up to 32 MiB for its next ones: .8 GiB after a picture of 24 megapixels in tiles.
@@ -16,7 +16,7 @@ def give_back() -> None:
     Source: GNU C Library manual, section 3.2.3 (``malloc_trim``).
 
     Example:
-        >>> give_back()
+        >>> release_freed_memory()
     """
     if (trim := _malloc_trim()) is not None:
         trim(0)

@@ -41,7 +41,7 @@ class ReconstructionHead(nn.Module, ABC):
 
     stride: int
     whole_image = False  # True if each output depends on the whole image, which then cannot be tiled
-    looked = False
+    range_checked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -61,8 +61,8 @@ class ReconstructionHead(nn.Module, ABC):
         if image.shape[1] != self.in_channels:
             remedy = layout_remedy(tuple(image.shape), self.in_channels)
             raise ValueError(f"image must have {self.in_channels} channels, got {image.shape[1]}{remedy}")
-        if not self.looked and Mode.GRAPH not in torch_mode():
-            self.looked = True  # for the first image only, as the check waits for the device
+        if not self.range_checked and Mode.GRAPH not in torch_mode():
+            self.range_checked = True  # for the first image only, as the check waits for the device
             if (said := check_head_image(image)) is not None:
                 warnings.warn(said, stacklevel=5)
 

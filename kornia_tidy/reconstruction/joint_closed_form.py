@@ -91,7 +91,7 @@ class JointClosedFormHead(ClosedFormHead):
                     f"and {refiner.out_channels}"
                 )
             zero_last_convolution(refiner, 3, "refiner")
-            refiner.looked = True  # no check of the range, as refocused maps leave [0, 1]
+            refiner.range_checked = True  # no check of the range, as refocused maps leave [0, 1]
             self.stride = math.lcm(self.stride, refiner.stride)
         self.refiner = refiner
         self.register_buffer("temperature", torch.ones(()))

@@ -129,7 +129,7 @@ class LayeredJointHead(ReconstructionHead):
                     f"{network.in_channels} and {network.out_channels}"
                 )
             zero_last_convolution(network, 1, name)
-            network.looked = True  # no check of the range, as deconvolved maps leave [0, 1]
+            network.range_checked = True  # no check of the range, as deconvolved maps leave [0, 1]
         super().__init__(3, depth_network.out_channels + 3)
         self.depth_network, self.image_network = depth_network, image_network
         self.layers, self.encoded = layers, encoded

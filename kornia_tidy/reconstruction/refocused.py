@@ -89,7 +89,7 @@ class Refocused(ReconstructionHead):
         check_count("layers", layers)
         super().__init__(network.in_channels - layers, network.out_channels)
         self.network, self.layers, self.stride = network, layers, network.stride
-        network.looked = True  # no check of the range, as refocused maps leave [0, 1]
+        network.range_checked = True  # no check of the range, as refocused maps leave [0, 1]
         self.register_buffer("filters", torch.zeros(0), persistent=False)
 
     def set_psfs(self, bank: PSFBank) -> None:

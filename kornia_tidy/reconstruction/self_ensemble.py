@@ -50,7 +50,7 @@ class SelfEnsemble(ReconstructionHead):
             raise ValueError(f"{type(network).__name__} sees the whole image, and cannot be turned")
         super().__init__(network.in_channels, network.out_channels)
         self.network, self.orientations, self.stride = network, orientations, network.stride
-        self.looked = network.looked
+        self.range_checked = network.range_checked
         self.train(network.training)
 
     def predict(self, image: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
-from kornia_tidy.reconstruction.freed_memory import give_back
+from kornia_tidy.reconstruction.freed_memory import release_freed_memory
 from kornia_tidy.reconstruction.head import sharing_weights
 from kornia_tidy.reconstruction.head_memory import head_bytes
 from kornia_tidy.reconstruction.receptive_field import (
@@ -25,7 +25,7 @@ from kornia_tidy.reconstruction.receptive_field import (
 )
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
-from kornia_tidy.reconstruction.whole_picture import untold_closed_forms, whole_picture
+from kornia_tidy.reconstruction.whole_picture import closed_forms_without_statistics, whole_picture
 
 # Shipped networks see 220 to 450 px far, but heed little beyond 100: tiles cut at 144 px differ from the whole by at
 # most 2e-4 of full scale (joint-uncertain, twelve draws of noise). At 128 px it is 6e-4, and was 1.2e-3 in another
@@ -93,7 +93,7 @@ def reconstruct_tiled(
     check_positive("memory_budget", memory_budget, "bytes")
     if overlap is not None and overlap < 0:
         raise ValueError(f"overlap must be 0 pixels or more, got {overlap}")
-    if untold := untold_closed_forms(head):
+    if untold := closed_forms_without_statistics(head):
         told = whole_picture(head, image, encoded=untold[0].encoded)
     else:
         told = nullcontext()
@@ -186,7 +186,7 @@ def _run(
         if progress is not None:
             progress(done + 1, len(tiles))
     if len(tiles) > 1:
-        give_back()
+        release_freed_memory()
     return result
 
 

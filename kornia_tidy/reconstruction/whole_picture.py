@@ -34,7 +34,7 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
         ...     restore.mean_light.flatten()
         tensor([0.2500, 0.2500, 0.2500])
     """
-    parts = untold_closed_forms(head)
+    parts = closed_forms_without_statistics(head)
     if parts:
         strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
         lights = (rgb_to_linear_rgb(strip) if encoded else strip for strip in strips)
@@ -50,11 +50,11 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
             part.mean_light = part.detail = None
 
 
-def untold_closed_forms(head: nn.Module) -> list[ClosedForm]:
+def closed_forms_without_statistics(head: nn.Module) -> list[ClosedForm]:
     """Return the closed forms in a network that estimate stray light or noise from the mean light of their own input.
 
     Example:
-        >>> untold_closed_forms(nn.Conv2d(3, 3, 1))
+        >>> closed_forms_without_statistics(nn.Conv2d(3, 3, 1))
         []
     """
     parts = [module for module in head.modules() if isinstance(module, ClosedForm)]

@@ -117,8 +117,8 @@ class NoiseFreeCaptures(Dataset):
             image, depth = scene["image"][None], scene["depth"][None]
             mask = scene["mask"][None] if "mask" in scene else torch.ones_like(depth, dtype=torch.bool)
             sample = self.optics({"image": self.decode(image), "depth": depth, "mask": mask})
-        nearness = normalised_inverse_depth(self.optics.camera, sample["depth"])
-        planes = torch.cat([sample["image"], sample["all_in_focus"], nearness, sample["mask"].float()], 1)[0]
+        inverse_depth = normalised_inverse_depth(self.optics.camera, sample["depth"])
+        planes = torch.cat([sample["image"], sample["all_in_focus"], inverse_depth, sample["mask"].float()], 1)[0]
         return (planes.clamp(0, 1) * LEVELS).round().numpy().astype(np.uint16)
 
 

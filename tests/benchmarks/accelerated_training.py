@@ -251,7 +251,7 @@ class Run:
     def prepare(self) -> None:
         """Make the network fast, and its optimisers."""
         network: Any = self.head.network
-        network.looked = True
+        network.range_checked = True
         self.plain = copy.deepcopy(network)
         if self.device.type == "cuda":
             shape = (self.args.batch, network.in_channels, SIZE, SIZE)
