@@ -76,7 +76,7 @@ class Field:
         half = (self.size[axis] - 1) / 2
         places = (pixels.double() - half) / max(half, 0.5)
         weights, slopes, bends = lagrange(self.nodes[axis], places.clamp(-1, 1))
-        inside = (places.abs() <= 1)[:, None] / max(half, 0.5)
+        inside = (places.abs() <= 1).double()[:, None] / max(half, 0.5)
         return weights, slopes * inside, bends * inside**2
 
     def tiles(self, axis: int, first: int, pixels: int, most: int, beyond: int = 0) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,0 +1,134 @@
+"""PSFs over the field: tiles in C against the definition by whole planes, and against cells of torch."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from kornia_tidy.psf import FieldBank
+from kornia_tidy.psf.field import Field
+from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.over_field import render_over_field
+from kornia_tidy.render.render_ops import Rendering, render_layers
+from tests.base import BaseTester
+from tests.kernels.operator_tester import needs_compiler
+
+SIZE = (70, 90)
+
+
+def bank_over(field: Field, dtype=torch.float64, *, veil: bool = False) -> FieldBank:
+    """PSFs of 3 layers and 2 channels that change smoothly from node to node."""
+    generator = torch.Generator().manual_seed(7)
+    parts = torch.rand(3, 3, 2, 9, 9, generator=generator, dtype=torch.float64)
+    places = torch.tensor(field.points, dtype=torch.float64) / 50
+    psfs = parts[0] + torch.einsum("fi,idcyx->fdcyx", places, 0.3 * parts[1:])
+    energy = psfs.sum((-2, -1))
+    light = 0.5 + 0.5 * torch.rand(energy.shape, generator=generator, dtype=torch.float64)
+    psfs = psfs / energy[..., None, None] * light[..., None, None]
+    nodes = torch.tensor([-4.0, 1.0, 5.0], dtype=torch.float64)
+    strayed = 0.1 * light if veil else None
+    given = psfs, nodes, torch.tensor(field.points, dtype=torch.float64), torch.ones_like(light), light, strayed
+    return FieldBank(*(x if x is None else x.to(dtype) for x in given))
+
+
+def scene_of(dtype=torch.float64, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(8)
+    light = torch.rand(batch, 2, *SIZE, generator=generator, dtype=torch.float64)
+    coarse = torch.rand(1, 1, 7, 9, generator=generator, dtype=torch.float64)
+    return light.to(dtype), (10 * coarse.repeat_interleave(10, 2).repeat_interleave(10, 3) - 5).to(dtype)
+
+
+@needs_compiler
+class TestRenderOverField(BaseTester):
+    @pytest.mark.parametrize("nodes", [(3, 2), (1, 3), (2, 1)])
+    @pytest.mark.parametrize("border", BORDERS)
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_tiles_equal_the_sum_over_nodes(self, compositing, border, nodes):
+        field = Field(SIZE, nodes, cell=20)
+        (light, defocus), bank = scene_of(), bank_over(field)
+        given = light, defocus, bank.defocus, bank.psfs, None
+        options = {"compositing": compositing, "border": border, "layers": "linear", "correlate": border == "zero"}
+        tiles, whole = (render_layers(*given, method=name, field=field, **options) for name in ("compiled", "dense"))
+        self.assert_close(tiles, whole, rtol=0, atol=1e-13)
+
+    @pytest.mark.parametrize("layers", ["linear", "nearest"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_gradients_equal_those_of_the_sum_over_nodes(self, compositing, layers):
+        field = Field(SIZE, (3, 2), origin=(0, 0), cell=24)
+        bank, gradient = bank_over(field), torch.randn(2, 2, *SIZE, dtype=torch.float64)
+        leaves = [x.clone().requires_grad_() for x in (*scene_of(), bank.psfs)]
+        wanted = leaves if layers == "linear" else leaves[::2]
+        found = []
+        for method in ("compiled", "dense"):
+            given = *leaves[:2], bank.defocus, leaves[2], None
+            options = {"compositing": compositing, "border": "reflect", "layers": layers, "correlate": False}
+            seen = render_layers(*given, method=method, field=field, **options)
+            found.append(torch.autograd.grad(seen, wanted, gradient))
+        for own, expected in zip(*found, strict=True):
+            self.assert_close(own, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+
+    @pytest.mark.parametrize(("real", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_the_gradient_is_the_adjoint(self, compositing, real, bound):
+        field = Field(SIZE, (4, 3))
+        (light, defocus), bank = scene_of(real), bank_over(field, real)
+        light.requires_grad_()
+        seen = render_over_field(light, defocus, bank, field, Rendering(compositing, "reflect"))
+        other = torch.randn(seen.shape, generator=torch.Generator().manual_seed(9), dtype=torch.float64).to(real)
+        (back,) = torch.autograd.grad(seen, light, other)
+        products = [a.detach().double() * b.detach().double() for a, b in ((seen, other), (light, back))]
+        assert abs(float((products[0].sum() - products[1].sum()) / products[0].norm())) < bound * SIZE[0]
+        assert abs(float(products[0].sum() / products[1].sum()) - 1) < bound * 10
+
+    @pytest.mark.parametrize("border", ["reflect", "valid", "zero"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_cells_of_torch_see_the_same(self, compositing, border):
+        """PSFs that are linear over the field are exact to first order: tiles and cells of any size agree."""
+        field = Field(SIZE, (2, 2), origin=(0, 0), cell=32)
+        (light, defocus), bank = scene_of(), bank_over(field, veil=True)
+        ways = [Rendering(compositing, border, method=method) for method in ("auto", "batched")]
+        bank = replace(bank, psfs=_without_product(bank.psfs), veil=_without_product(bank.veil))
+        tiles, cells = (render_over_field(light, defocus, bank, field, way) for way in ways)
+        self.assert_close(tiles, cells, rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_parts_of_a_picture_are_those_of_the_whole(self, compositing):
+        field = Field(SIZE, (3, 2), cell=25)
+        (light, defocus), bank = scene_of(), bank_over(field)
+        whole = render_over_field(light, defocus, bank, field, Rendering(compositing, "valid"))
+        part = light[..., 13:60, 7:], defocus[..., 13:60, 7:]
+        own = render_over_field(*part, bank, field.moved(13, 7), Rendering(compositing, "valid"))
+        self.assert_close(own, whole[..., 13:52, 7:], rtol=0, atol=1e-13)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_gradcheck_of_gradients(self, compositing):
+        field = Field((6, 7), (2, 2))
+        bank = bank_over(field)
+        light = torch.rand(1, 2, 6, 7, dtype=torch.float64, requires_grad=True)
+        psfs = bank.psfs[..., 3:6, 3:6].clone().requires_grad_()
+        defocus = torch.linspace(-3.5, 4.5, 42, dtype=torch.float64).view(1, 1, 6, 7)
+        options = {"compositing": compositing, "border": "reflect", "layers": "linear", "correlate": False}
+
+        def render(light: torch.Tensor, psfs: torch.Tensor) -> torch.Tensor:
+            return render_layers(light, defocus, bank.defocus, psfs, None, method="auto", field=field, **options)
+
+        assert torch.autograd.gradcheck(render, (light, psfs), fast_mode=True)
+        assert torch.autograd.gradgradcheck(render, (light, psfs), fast_mode=True)
+
+    def test_exception_backends_of_one_psf(self):
+        field = Field(SIZE, (2, 2))
+        (light, defocus), bank = scene_of(), bank_over(field)
+        options = {"border": "reflect", "layers": "linear", "correlate": False, "field": field}
+        given = light, defocus, bank.defocus, bank.psfs, None
+        for method, compositing in (("batched", "gather"), ("compiled", "occlusion"), ("dense", "occlusion")):
+            with pytest.raises(ValueError, match=f"method '{method}' does not .* vary over the picture .*cell by cell"):
+                render_layers(*given, compositing=compositing, method=method, **options)
+
+
+def _without_product(values: torch.Tensor) -> torch.Tensor:
+    """Values at 2 x 2 nodes without the term that is a product of row and column."""
+    values = values.clone()
+    values[3] = values[1] + values[2] - values[0]
+    return values
