@@ -11,6 +11,7 @@ import kornia.augmentation as K
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.augmentation.pipeline_transform import AugmentationTransform
 from kornia_tidy.augmentation.ranges import check_probability
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs
 from kornia_tidy.camera.holes import fills_holes
@@ -174,6 +175,11 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
                 f"{type(self).__name__} takes tensors as (image, depth), got a {type(input).__name__}: OpticsPipeline "
                 f"takes tuples and mappings"
             )
+        if not input.is_floating_point():
+            raise TypeError(
+                f"image must be floating point in [0, 1], got {input.dtype}: divide it by the largest value of its type, "
+                f"or use as_transform(), which takes 8 and 16 bits"
+            )
         if depth is None:
             return super().forward(input, params=params, **kwargs)
         check_float_tensor("depth", depth, input.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")
@@ -182,6 +188,16 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
             return super().forward(input, params=params, **kwargs)
         finally:
             self.bound = before
+
+    def as_transform(self, seed: int | None = None, key: Any = "index", **entries: Any) -> AugmentationTransform:
+        """Return the augmentation as a transform of single samples. See :class:`AugmentationTransform`.
+
+        Args:
+            seed: gives each item its own draws, the same for any number of workers.
+            key: the entry that tells items apart, or a function of the sample.
+            entries: ``image_key=``, ``depth_key=``, ``depth_scale=`` and ``holes=``.
+        """
+        return AugmentationTransform(self, seed, key, **entries)
 
     @outside_graphs  # which rows are computed depends on values
     def apply_transform(

@@ -1,12 +1,14 @@
-"""An augmentation pipeline as the transform of a data set: the same draws for an item, whoever loads it."""
+"""Augmentations and pipelines as transforms of a data set: the same draws for an item, whoever loads it."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from kornia_tidy.camera.dataset_transform import DatasetTransform
+from kornia_tidy.psf.field import check_centers
 
 
 class PipelineTransform(DatasetTransform):
@@ -41,3 +43,42 @@ class PipelineTransform(DatasetTransform):
         with torch.random.fork_rng():
             torch.manual_seed(generator.initial_seed())
             return self.optics(sample)
+
+
+class AugmentationTransform(DatasetTransform):
+    """Call an augmentation that reads depth on single samples of a data set. Made by ``augmentation.as_transform()``.
+
+    Arguments, samples and errors are those of :class:`~kornia_tidy.camera.dataset_transform.DatasetTransform`: images
+    of 8 or 16 bits, arrays and PIL images, and depth in whole numbers with its ``depth_scale``.
+
+    Convention:
+        - With a seed, the state of torch's global generator is put back after each item.
+
+    Example:
+        >>> from kornia_tidy.augmentation import RandomDepthBlur
+        >>> transform = RandomDepthBlur(p=1.0).as_transform(seed=7, depth_scale=0.001)
+        >>> millimetres = torch.full((1, 48, 48), 900, dtype=torch.int32)
+        >>> sample = {"image": torch.zeros(3, 48, 48, dtype=torch.uint8), "depth": millimetres, "index": 12}
+        >>> transform(sample)["image"].dtype
+        torch.uint8
+    """
+
+    takes_samples = False
+
+    def _capture(
+        self,
+        image: Tensor,
+        depth: Tensor,
+        generator: torch.Generator | None = None,
+        field_center: Any = None,
+    ) -> Tensor:
+        with torch.random.fork_rng(enabled=generator is not None):
+            if generator is not None:
+                torch.manual_seed(generator.initial_seed())
+            params = None
+            if field_center is not None:  # of a lens, in the draws of the augmentation
+                shape = image.shape if image.ndim == 4 else (1, *image.shape)
+                centers = torch.tensor(check_centers(field_center, shape[0]), dtype=torch.float64)
+                params = self.optics.forward_parameters(shape) | {"field_center": centers.expand(shape[0], 2)}
+            coded = self.optics(image, depth, params=params)
+        return coded[0] if coded.ndim > image.ndim else coded

@@ -58,6 +58,9 @@ class DatasetTransform:
         True
     """
 
+    takes_samples = True
+    """Whether the camera takes tuples and mappings itself."""
+
     def __init__(
         self,
         optics: nn.Module,
@@ -105,14 +108,18 @@ class DatasetTransform:
             sample = with_filled(sample, depth, valid, names[1:])
         metres = self.depth_scale in (None, 1) and isinstance(depth, Tensor) and depth.is_floating_point()
         device = next(chain(self.optics.parameters(), self.optics.buffers()), torch.empty(0)).device
-        ready = plain and metres and isinstance(image, Tensor) and image.is_floating_point()
+        ready = self.takes_samples and plain and metres and isinstance(image, Tensor) and image.is_floating_point()
         if ready and image.device == depth.device == device:
             return self.optics(sample, **options)
         whole = image_tensor(image)
-        coded = self.optics(whole.to(device), depth_tensor(depth, self.depth_scale).to(device), **options)
+        coded = self._capture(whole.to(device), depth_tensor(depth, self.depth_scale).to(device), **options)
         coded = coded.to(whole.device)
         margin = (whole.shape[-2] - coded.shape[-2]) // 2
         return with_capture(sample, like_image(coded, image), margin, names, cropped_image)
+
+    def _capture(self, image: Tensor, depth: Tensor, **options: Any) -> Tensor:
+        """Return the capture of an image in the image's rank."""
+        return self.optics(image, depth, **options)
 
     def _names(self, sample: Mapping[str, Any]) -> tuple[str, str]:
         """Return the names of image and depth in a mapping."""
