@@ -177,8 +177,8 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
             )
         if not input.is_floating_point():
             raise TypeError(
-                f"image must be floating point in [0, 1], got {input.dtype}: divide it by the largest value of its type, "
-                f"or use as_transform(), which takes 8 and 16 bits"
+                f"image must be floating point in [0, 1], got {input.dtype}: divide it by the largest value of its "
+                f"type, or use as_transform(), which takes 8 and 16 bits"
             )
         if depth is None:
             return super().forward(input, params=params, **kwargs)
