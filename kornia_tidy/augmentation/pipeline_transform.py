@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -65,13 +65,8 @@ class AugmentationTransform(DatasetTransform):
 
     takes_samples = False
 
-    def _capture(
-        self,
-        image: Tensor,
-        depth: Tensor,
-        generator: torch.Generator | None = None,
-        field_center: Any = None,
-    ) -> Tensor:
+    def _capture(self, image: Tensor, depth: Tensor, **options: Any) -> Tensor:
+        generator, field_center = options.get("generator"), options.get("field_center")
         with torch.random.fork_rng(enabled=generator is not None):
             if generator is not None:
                 torch.manual_seed(generator.initial_seed())
@@ -79,6 +74,7 @@ class AugmentationTransform(DatasetTransform):
             if field_center is not None:  # of a lens, in the draws of the augmentation
                 shape = image.shape if image.ndim == 4 else (1, *image.shape)
                 centers = torch.tensor(check_centers(field_center, shape[0]), dtype=torch.float64)
-                params = self.optics.forward_parameters(shape) | {"field_center": centers.expand(shape[0], 2)}
+                augmentation = cast("Any", self.optics)
+                params = augmentation.forward_parameters(shape) | {"field_center": centers.expand(shape[0], 2)}
             coded = self.optics(image, depth, params=params)
         return coded[0] if coded.ndim > image.ndim else coded
