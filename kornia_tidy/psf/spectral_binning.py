@@ -29,7 +29,7 @@ def bin_spectrum(spectrum: Spectrum, count: int) -> Spectrum:
     Returns:
         The channels of ``spectrum``, with the light that they had. A basis becomes its mean in each slice, and is then
         mixed such that each channel sees its own colour again. For five random masks and the Nikon in D65, against
-        PSFs at 61 wavelengths (see :func:`kornia_tidy.psf.spectral_error.spectral_error`): 3 are off by 0.041, 5 by
+        PSFs at 61 wavelengths (absolute differences, summed): 3 are off by 0.041, 5 by
         0.012, 7 by 0.0054, 11 by 0.0017 and 16 by 0.0007, where as many equal slices are by 0.086, 0.028, 0.010,
         0.0035 and 0.0013.
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
-import numpy as np
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-from numpy.typing import NDArray
+from kornia.color import linear_rgb_to_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
-from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
@@ -167,28 +164,3 @@ def reconstruct_light(
     deviation = named["deviation"]
     in_metres = deviation_in_metres(head.camera, near, deviation)
     return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation)
-
-
-def reconstruct_opencv(
-    head: LightHead, picture: NDArray[Any], *, linear: bool = False, memory_budget: int = 512 << 20
-) -> tuple[NDArray[Any] | None, NDArray[np.float32] | None]:
-    """Reconstruct image and depth from a capture in an OpenCV array.
-
-    Args:
-        head: a trained network.
-        picture: (H, W, 3) in BGR or (H, W), uint8 or uint16.
-        linear: True if the picture holds linear light, False if it is encoded as sRGB.
-        memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
-
-    Returns:
-        The image, (H, W, 3) in BGR, encoded as sRGB, of the picture's data type; the depth, (H, W) float32 in metres.
-        None for a map that the network was not trained for.
-    """
-    light = from_opencv(picture)
-    if not linear:
-        light = rgb_to_linear_rgb(light.expand(3, -1, -1))
-    image, depth, *_ = reconstruct_light(head, light, memory_budget=memory_budget)
-    return (
-        None if image is None else to_opencv(image, picture.dtype),
-        None if depth is None else depth[0].numpy(),
-    )

@@ -16,36 +16,13 @@ from kornia_tidy.mode import Mode, torch_mode
 LAYER_MODES = ("nearest", "linear")
 
 
-def clamp_defocus(defocus: Tensor, nodes: Tensor) -> tuple[Tensor, Tensor]:
-    """Move defocus beyond the end nodes to the end nodes, and say where that was done.
-
-    Args:
-        defocus: defocus map in radians, any shape.
-        nodes: (D,) ascending defocus of the layers in radians.
-
-    Returns:
-        The clamped defocus in float32 or float64, and a bool mask of ``defocus``'s shape: True where it lay outside.
-
-    Convention:
-        An end node itself is inside. Clamped values have no gradient.
-
-    Example:
-        >>> import torch
-        >>> clamp_defocus(torch.tensor([-30.0, 0.0, 20.0]), torch.tensor([-20.0, 20.0]))
-        (tensor([-20.,   0.,  20.]), tensor([ True, False, False]))
-    """
-    dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
-    defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    return defocus.clamp(nodes[0], nodes[-1]), (defocus < nodes[0]) | (defocus > nodes[-1])
-
-
 def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Tensor]:
     r"""Return the layer below each pixel's defocus and the weight of the next layer.
 
     .. math:: t = \frac{\psi - \psi_i}{\psi_{i+1} - \psi_i}, \qquad \psi_i \le \psi \le \psi_{i+1}
 
     Args:
-        defocus: (B, 1, H, W) defocus in radians. Values beyond the nodes are clamped, see :func:`clamp_defocus`.
+        defocus: (B, 1, H, W) defocus in radians. Values beyond the nodes are clamped.
         nodes: (D,) defocus of the layers in radians, strictly ascending; the spacing may vary.
         mode: ``"linear"`` shares the light between two layers, ``"nearest"`` gives all of it to one.
 

@@ -6,12 +6,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from kornia.color import rgb_to_linear_rgb
 
 import kornia_tidy
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
-from kornia_tidy.data import read_rgbd
-from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_opencv
+from kornia_tidy.data import from_opencv, read_rgbd, to_opencv
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from tests.base import BaseTester
 
@@ -138,14 +139,16 @@ class TestSimulate(BaseTester):
 
 class TestReconstruct(BaseTester):
     @pytest.mark.parametrize("kind", MOST)
-    def test_feature_the_images_of_the_existing_function(self, kind, head):
+    def test_feature_the_images_of_linear_light(self, kind, head):
         capture = picture(kind, 2, 32, 48, 3)
         image, depth = kornia_tidy.reconstruct(capture, head)
         assert image.dtype == capture.dtype
         assert image.shape == capture.shape
         assert depth.shape == (2, 32, 48)
         given = capture[1] if kind != "float32" else np.rint(65535 * capture[1]).astype(np.uint16)
-        expected, metres = reconstruct_opencv(head, given)
+        light = rgb_to_linear_rgb(from_opencv(given))
+        found, metres = reconstruct_light(head, light)
+        expected, metres = to_opencv(found, given.dtype), metres[0].numpy()
         most = np.iinfo(given.dtype).max
         assert np.abs(image[1] / MOST[kind] - expected / most).max() < 1e-3
         assert np.allclose(1 / depth[1], 1 / metres, atol=1e-3)

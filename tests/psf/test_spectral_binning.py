@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.psf.spectral_binning import bin_spectrum
-from kornia_tidy.psf.spectral_error import spectral_error
 from tests.base import BaseTester
+from tests.psf.spectral_error import spectral_error
 
 MANY = camera_spectrum(samples=31)
 

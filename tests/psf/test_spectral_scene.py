@@ -13,8 +13,8 @@ from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.optics.spectrum import smoothest_reflectances
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.psf.spectral_error import spectral_error
 from tests.base import BaseTester
+from tests.psf.spectral_error import spectral_error
 
 SMALL = Fidelity(window=9, layer_spacing=8.0)
 

@@ -12,13 +12,13 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
+import kornia_tidy
 from kornia_tidy.data import DeadLeaves, PhotographicLeaves
 from kornia_tidy.reconstruction import receptive_field
 from kornia_tidy.reconstruction.light_head import (
     LightHead,
     UncertainReconstruction,
     reconstruct_light,
-    reconstruct_opencv,
     with_noise_of,
 )
 from kornia_tidy.reconstruction.pretrained import load_pretrained
@@ -232,7 +232,7 @@ class TestReconstructLight(BaseTester):
         self.assert_close(result.depth, torch.full((1, 5, 6), 0.595))
         self.assert_close(result.relative_deviation, torch.full((1, 5, 6), 0.5))
         assert result.deviation.isinf().all()
-        _, depth = reconstruct_opencv(head, np.full((4, 5), 77, np.uint8))
+        _, depth = kornia_tidy.reconstruct(np.full((4, 5), 77, np.uint8), head)
         assert depth.shape == (4, 5)
 
     def test_feature_the_light_is_left_alone(self):
@@ -246,23 +246,23 @@ class TestReconstructLight(BaseTester):
             reconstruct_light(light_head("edof"), torch.rand(2, 4, 4))
 
 
-class TestReconstructOpenCV(BaseTester):
+class TestPictures(BaseTester):
     @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
     def test_feature_a_network_that_passes_gives_the_picture_back(self, kind):
         picture = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (20, 30, 3), kind)
-        image, depth = reconstruct_opencv(light_head("joint"), picture)
+        image, depth = kornia_tidy.reconstruct(picture, light_head("joint"))
         assert image.dtype == kind
         assert depth.shape == (20, 30)
         assert np.abs(image.astype(int) - picture).max() <= (1 if kind is np.uint8 else 3)
 
     def test_feature_linear_pictures_come_back_encoded(self):
         picture = np.full((4, 4, 3), 32768, np.uint16)
-        image, _ = reconstruct_opencv(light_head("edof"), picture, linear=True)
+        image, _ = kornia_tidy.reconstruct(picture, light_head("edof"), linear=True)
         assert abs(int(image[0, 0, 0]) - 65535 * 0.73536) < 3  # sRGB's encoding of 0.5
 
     def test_feature_grey_pictures_and_color_order(self):
-        grey, _ = reconstruct_opencv(light_head("edof"), np.full((4, 5), 77, np.uint8))
+        grey, _ = kornia_tidy.reconstruct(np.full((4, 5), 77, np.uint8), light_head("edof"))
         assert grey.shape == (4, 5, 3)
         blue = np.zeros((4, 4, 3), np.uint8)
         blue[..., 0] = 200
-        assert cv2.split(reconstruct_opencv(light_head("edof"), blue)[0])[0].mean() == pytest.approx(200, abs=1)
+        assert cv2.split(kornia_tidy.reconstruct(blue, light_head("edof"))[0])[0].mean() == pytest.approx(200, abs=1)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.render.layers import assign_layers, clamp_defocus, layer_weights, present_layers, weight_of_layer
+from kornia_tidy.render.layers import assign_layers, layer_weights, present_layers, weight_of_layer
 from tests.base import BaseTester
 from tests.render.scenes import brute_weights
 
@@ -15,19 +15,6 @@ NODES = (-20.0, -11.0, -4.0, 0.0, 7.0, 20.0)
 
 def row(*values, **like):
     return torch.tensor(values, **like).view(1, 1, 1, -1)
-
-
-class TestClampDefocus(BaseTester):
-    def test_feature_only_values_beyond_the_nodes_move_and_are_marked(self, device, dtype):
-        defocus = row(-25.0, -20.0, 3.0, 20.0, 20.5, float("inf"), device=device, dtype=dtype)
-        clamped, outside = clamp_defocus(defocus, torch.tensor(NODES, device=device, dtype=dtype))
-        assert clamped.flatten().tolist() == [-20.0, -20.0, 3.0, 20.0, 20.0, 20.0]
-        assert outside.flatten().tolist() == [True, False, False, False, True, True]
-
-    def test_feature_half_precision_is_left_for_float32(self, device):
-        half = {"device": device, "dtype": torch.float16}
-        clamped, _ = clamp_defocus(row(1.0, **half), torch.tensor(NODES, **half))
-        assert clamped.dtype == torch.float32
 
 
 class TestLayerWeights(BaseTester):
