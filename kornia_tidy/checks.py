@@ -56,7 +56,7 @@ def check_part(name: str, value: Any, kind: type | tuple[type, ...], example: st
 
 
 def unmasked(name: str, value: Any) -> Any:
-    """Return a masked array of NumPy as a plain one, and anything else as it is.
+    """Return a masked array of NumPy as a plain one, and anything else unchanged.
 
     Raises:
         ValueError: if a value is masked.

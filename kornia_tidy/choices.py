@@ -1,4 +1,4 @@
-"""Names that settings choose from, without what they name: torch is not imported, so that ``--help`` comes at once."""
+"""Names that settings choose from, without their objects: torch is not imported, so that ``--help`` comes at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COMPOSITING = ("gather", "scatter", "occlusion")
 BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
 STRAY_LIGHT = ("renormalize", "veil", "discard")
 COLOR_SPACES = ("srgb", "linear", "paper")
-HOLES = ("error", "fill")  # what a camera and its adapters do about holes
+HOLES = ("error", "fill")  # how a camera and its adapters treat holes
 STARTS = (
     "noise", "fisher, noise", "noisy fishers", "fisher, noisy fishers", "3 fishers, 2 noisy", "like fishers",
     "focal sweep", "flat",

@@ -20,7 +20,7 @@ class Fidelity:
       the image. Against windows of 513 and 641 px, on dead leaves: 9e-4 for five random masks (95 % held) and a flat
       one (43 px), 7e-4 for a smooth one and Fresnel lenses. On photographs, which are brighter on one side than on the
       other, more: with a random mask 1.2e-3 on Middlebury's Motorcycle, 2.5e-3 on Aloe. For the five random masks
-      385 px would be at 4e-4, for 2.2 times the PSFs' time and memory. What borders do to it stands in the table.
+      385 px would be at 4e-4, for 2.2 times the PSFs' time and memory. The table shows the effect of borders.
     - depths between its layers: 1.5e-6 for random masks, against linear layers 1/64 rad apart (linear layers 1 rad
       apart: 4e-5); up to 1e-4 for a flat mask in focus on black and white shapes.
     - integration over sensor pixels: 5e-12, and rounding.
@@ -43,17 +43,17 @@ class Fidelity:
     ``"zero"``, occlusion   1e-6, 2.0e-3, 4.1e-4     1e-6, 2.9e-3, 6.0e-4
     ======================  =======================  =======================
 
-    Where the border continues the image, the stray light is wrong by what the light out there differs from the image's
-    mean, at most by the share of stray light times the contrast. With ``"zero"`` only as much is spread as stays in the
-    image (:func:`kornia_tidy.render.stray_light.share_within`), which is nothing for a window of
-    ``2 * max(height, width) - 1`` pixels: then nothing is left out. Of the other choices, ``"renormalize"`` gives white
-    right but for ``"zero"`` (3.3e-2 with the random mask), and ``"discard"`` darkens it by all that is lost (3.8e-2)
-    but for ``"zero"`` (2.1e-3). With ``"valid"`` nobody knows what lies beyond the image; its mean stands for it.
+    Where the border continues the image, the error of the stray light is the difference of the light there from the
+    image's mean, at most the share of stray light times the contrast. With ``"zero"`` only as much is spread as stays
+    in the image (:func:`kornia_tidy.render.stray_light.share_within`), which is nothing for a window of ``2 *
+    max(height, width) - 1`` pixels: then nothing is left out. Of the other choices, ``"renormalize"`` gives white right
+    but for ``"zero"`` (3.3e-2 with the random mask), and ``"discard"`` darkens it by all that is lost (3.8e-2) but for
+    ``"zero"`` (2.1e-3). With ``"valid"`` the light beyond the image is unknown; the image's mean replaces it.
 
-    How layers are chosen by tolerance: :meth:`kornia_tidy.TiDyOptics.plan` takes, of all kinds and spacings, the
-    cheapest whose error on the scene is within what was asked. On 35 photographs with a random mask that was
-    ``"nearest"`` 4 or 8 rad apart for 1e-1 and mostly for 1e-2, ``"linear"`` 2 or 4 rad apart for 1e-3, 1 rad for 1e-4,
-    0.5 rad or ``"cubic"`` 1 rad apart for 1e-5, and ``"bandlimited"`` for 1e-6.
+    :meth:`kornia_tidy.TiDyOptics.plan` chooses layers by tolerance: of all kinds and spacings, the cheapest with an
+    error on the scene within the tolerance. On 35 photographs with a random mask that was ``"nearest"`` 4 or 8 rad
+    apart for 1e-1 and mostly for 1e-2, ``"linear"`` 2 or 4 rad apart for 1e-3, 1 rad for 1e-4, 0.5 rad or ``"cubic"`` 1
+    rad apart for 1e-5, and ``"bandlimited"`` for 1e-6.
 
     Args:
         name: name of the fidelity, for messages.
@@ -156,7 +156,7 @@ class Fidelity:
         the others, and ``paper`` for reproducing published numbers.
 
         Raises:
-            ValueError: if there is no such preset.
+            ValueError: if no preset has this name.
         """
         check_choice("fidelity", name, tuple(PRESETS))
         return PRESETS[name]
@@ -166,7 +166,7 @@ class Fidelity:
         """Return a fidelity unchanged, or the preset of a name.
 
         Raises:
-            ValueError: if there is no such preset.
+            ValueError: if no preset has this name.
             TypeError: if it is neither.
         """
         if isinstance(value, str):

@@ -1,6 +1,6 @@
 """File input and output: errors of one sentence, text in any Unicode form, atomic writes, and locks of folders.
 
-No package is used for atomic writes: atomicwrites is no longer maintained, and writes no folders.
+No package is used for atomic writes: atomicwrites is unmaintained, and writes no folders.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Read a whole file.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is no regular file, empty, or larger than the memory.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is not a regular file, is empty, or is larger than the memory.
     """
     path = check_file(path)
     try:
@@ -56,10 +56,10 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 def check_file(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file that is there.
+    """Return the path of an existing file.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is a folder, or no regular file: a pipe or a device might never end; or if no file can have
             this name.
     """
@@ -84,11 +84,11 @@ def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
 
     Args:
         path: of the file.
-        errors: of what is no text, as for ``bytes.decode``.
+        errors: how to treat bytes that are not text, as for ``bytes.decode``.
 
     Raises:
-        FileNotFoundError: if there is none.
-        ValueError: if it is no text.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is not a text.
 
     Example:
         >>> import tempfile
@@ -111,7 +111,7 @@ def find_files(root: str | os.PathLike[str], pattern: str) -> Iterator[Path]:
     Convention:
         Hidden files and those in hidden folders are passed by, as a shell's ``*`` does: names that begin with a dot,
         unless the pattern has the dot. macOS leaves ``._name`` beside each file on drives of other systems, and in the
-        folder ``__MACOSX`` of archives. That and what Windows hides, such as ``Thumbs.db``, are passed by too.
+        folder ``__MACOSX`` of archives. That and what Windows hides, such as ``Thumbs.db``, are also ignored.
     """
     dotted = [part for part in PurePath(pattern).parts if part.startswith(".")]
     for path in Path(root).glob(pattern):
@@ -124,7 +124,7 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """Read a file of JSON.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is not JSON, or is nested too deep; the path is named.
     """
     text = read_text(path)
@@ -138,7 +138,7 @@ def parse_json(text: str | bytes) -> Any:
     """Parse a text of JSON, which may come from anybody.
 
     Raises:
-        ValueError: if it is not JSON; is longer than 8 MiB, of which objects make up to 50 times as much; is nested
+        ValueError: if it is not JSON; is longer than 8 MiB, since objects take up to 50 times as much; is nested
             deeper than 100 levels; names a value twice; or holds a whole number of more than 300 digits, beyond floats.
 
     Convention:
@@ -208,7 +208,7 @@ def replacing(path: str | os.PathLike[str]) -> Generator[Path]:
         ValueError: if the path is a folder, or no regular file.
 
     Convention:
-        A symbolic link at ``path`` is replaced by the file; the file that it leads to is left alone.
+        A symbolic link at ``path`` is replaced by the file; the link's target is not touched.
     """
     path = Path(path)
     check_writable(path)

@@ -1,11 +1,11 @@
 """How torch runs: eagerly, compiled to a graph, under a transform of torch.func, or with values left unread.
 
 Tracing needs plain operations of torch throughout. C kernels, caches and branches on tensor values are disabled under
-tracing. Each time a value of an accelerator is read the host waits for it, so a capture reads what it needs at once.
+tracing. Each time a value of an accelerator is read the host waits for it, so a capture reads all its values at once.
 
 Torch keeps its modes for each thread, and so does :func:`values_unread`, the only state of a thread in the package. An
-argument cannot carry it: the checks that it skips are in the lens, the PSF model and the renderer, of which some are
-reached through methods that users write and operators of torch.
+argument cannot carry it: the checks that it skips are in the lens, the PSF model and the renderer, and some of these
+are reached through methods of users and operators of torch.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ TORCHSCRIPT = (
 
 
 class Mode(Flag):
-    """How torch runs what is computed now: with values, or traced.
+    """How torch runs the current computation: with values, or traced.
 
-    ``EAGER`` is none of the others. ``TRACED`` holds both kinds of tracing, which want plain operations and no caches.
+    ``EAGER`` excludes the others. ``TRACED`` holds both kinds of tracing, which want plain operations and no caches.
     """
 
     EAGER = 0
@@ -56,7 +56,7 @@ _thread = _Thread()
 
 
 def torch_mode() -> Mode:
-    """Return how torch runs what is computed now.
+    """Return how torch runs the current computation.
 
     Example:
         >>> torch.func.grad(lambda x: x * (Mode.TRANSFORM in torch_mode()))(torch.tensor(0.0)), torch_mode()

@@ -44,9 +44,7 @@ def import_installed(name: str) -> Any:
             __import__(name)
             return sys.modules[name]
         finally:
-            before += [
-                entry for entry in sys.path if entry not in before
-            ]  # a package may have added folders of its own
+            before += [entry for entry in sys.path if entry not in before]  # a package may have added folders
             sys.path = before
 
 
@@ -82,7 +80,7 @@ def find_program(name: str) -> str:
     """Return the path of a program, from the absolute entries of ``PATH``: others depend on the current folder.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if the file is missing.
     """
     entries = filter(os.path.isabs, os.environ.get("PATH", os.defpath).split(os.pathsep))
     found = shutil.which(name, path=os.pathsep.join(entries))

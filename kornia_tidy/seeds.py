@@ -8,7 +8,7 @@ import torch
 
 
 def keyed_seed(*keys: int | str) -> int:
-    """Return a seed determined by these keys alone; similar keys give unrelated seeds.
+    """Return a seed determined only by these keys; similar keys give unrelated seeds.
 
     Example:
         >>> keyed_seed(0, "noise", 3) == keyed_seed(0, "noise", 3) != keyed_seed(0, "noise", 4)

@@ -1,8 +1,8 @@
 """Settings: fields of dataclasses with type, unit, range, default and purpose, each written once.
 
 Commands make their options from them, and the page in the browser its controls. The purpose of a field is its entry in
-the docstring's ``Args``; a sentence there that begins with ``None:`` says what takes the place of a value that is not
-given. Modules of settings import neither torch nor NumPy, so that ``--help`` is there at once.
+the docstring's ``Args``; a sentence there that begins with ``None:`` names the replacement of a missing value. Modules
+of settings import neither torch nor NumPy, so that ``--help`` is there at once.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MOST_PROCESSES = 1024  # more would exhaust a machine
 
 @dataclass(frozen=True)
 class Unit:
-    """Unit and range of a number in settings, and what stands for it in ``--option VALUE``.
+    """Unit and range of a number in settings, and its placeholder in ``--option VALUE``.
 
     Args:
         symbol: for its value; two words for a pair.
@@ -46,7 +46,7 @@ class Unit:
     infinite: bool = False
 
     def complaint(self, value: Any, kind: type) -> str:
-        """Return what is wrong with a number, as the end of a sentence; nothing if it is allowed."""
+        """Return the fault of a number as the end of a sentence; an empty text if it is allowed."""
         if _is_number(value, kind) and (self.infinite or -inf < value < inf) and self._holds(value):
             return ""
         return f"must be {self._allowed(kind)}, got {value!r:.80}"
@@ -70,7 +70,7 @@ class Choice(Unit):
 
     Args:
         choices: the values.
-        words: what they mean, if names do not say it.
+        words: their meanings, if names do not suffice.
         others: other values are checked elsewhere.
     """
 
@@ -79,13 +79,13 @@ class Choice(Unit):
     others: bool = False
 
     def complaint(self, value: Any, kind: type) -> str:
-        """Return what is wrong with a value, as the end of a sentence; nothing if it is one of the choices."""
+        """Return the fault of a value as the end of a sentence; an empty text if it is one of the choices."""
         known = value in self.choices or (self.others and isinstance(value, kind))
         return "" if known else f"must be one of {', '.join(map(repr, self.choices))}, got {value!r:.80}"
 
 
 def one_of(choices: Iterable[Any], *, others: bool = False) -> Choice:
-    """Return the unit of a setting that has one of some values, or of the keys of what they mean.
+    """Return the unit of a setting with one of some values, or of the keys of their meanings.
 
     Example:
         >>> one_of(["edof", "depth"]).complaint("depht", str)
@@ -200,7 +200,7 @@ def plain(text: str) -> str:
 
 
 def _purpose(entry: str) -> tuple[str, str]:
-    """Split an entry of a docstring into purpose and what takes the place of None; what only refers is left out."""
+    """Split an entry of a docstring into its purpose and the replacement of None; mere references are left out."""
     text = re.sub(r"[,;]? \(?[Ss]ee [^.;]*\)?(?=[.;]|$)", "", entry)
     before, _, after = text.partition("None: ")
     unset, _, more = f"{after} ".partition(". ")
@@ -218,7 +218,7 @@ def check_settings(settings: Any) -> None:
 
 
 def complaint_about(setting: Setting, value: Any) -> str:
-    """Return what is wrong with the value of a setting, as the end of a sentence; nothing if it is allowed."""
+    """Return the fault of a setting's value as the end of a sentence; an empty text if it is allowed."""
     if setting.items is not None:
         if not isinstance(value, (tuple, list)) or (setting.items and len(value) != setting.items):
             return f"must be {'two' if setting.items == 2 else setting.items or 'some'} values, got {value!r:.80}"

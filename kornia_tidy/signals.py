@@ -81,7 +81,7 @@ def raised_signals() -> Generator[None]:
 
 
 def status_and_sentence(number: int) -> tuple[int, str]:
-    """Return the exit status of a command that a signal ended, and what it says.
+    """Return the exit status of a command that a signal ended, and its message.
 
     Example:
         >>> status_and_sentence(signal.SIGINT)

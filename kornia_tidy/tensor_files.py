@@ -29,7 +29,7 @@ def read_tensors(
         Tensors by name, copied from the file, and the metadata of its header by name.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is not a regular file, damaged, of another format, or its header is longer than 16 MiB.
 
     Example:

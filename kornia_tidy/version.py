@@ -1,3 +1,3 @@
-"""Version of the package, which ``__init__.py`` exports; here what lies below can read it too."""
+"""Version of the package, which ``__init__.py`` exports; lower packages read it here."""
 
 __version__ = "0.1.0"

@@ -82,7 +82,7 @@ def rendering_work(
         window: side of the PSFs.
         layers: ``"nearest"`` or ``"linear"``.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        border: what lies beyond the image.
+        border: continuation of the image beyond its edges.
         double: in float64.
 
     Example:

@@ -62,7 +62,7 @@ class Depths:
         defocus: (B, 1, H, W) or (1, 1, H, W) radians.
         lo: least defocus of the camera; values below are clamped.
         hi: largest defocus of the camera; values above are clamped.
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`.
         margin: pixels at each side of the image that the capture does not show.
         bins: how many there may be.
 
@@ -84,7 +84,7 @@ class Depths:
         self._border = "reflect" if border == "valid" else border
         self._rows, self._columns = (_whole_cells(side) for side in defocus.shape[-2:])
         whole = torch.ones(1, 1, *defocus.shape[-2:])
-        inner = pad(cropped(whole, margin), (margin,) * 4)  # what the capture shows
+        inner = pad(cropped(whole, margin), (margin,) * 4)  # the capture
         self.seen = float(inner.mean())
         self._image, self._shown = (extended(each, self._rows, self._columns, "zero") for each in (whole, inner))
 

@@ -50,7 +50,7 @@ from kornia_tidy.render.stray_light import share_in_frame, share_within
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.3 times the formula
 WINDOW_SAFETY = 1.7  # factor for windows; measured up to 1.5, as tails are sampled at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; measured with mutual intensity up to 3.3e-7
-POINT_SAFETY = 1.6  # factor for quadrature points; measured up to 1.5, as they are sampled at a few depths only
+POINT_SAFETY = 1.6  # factor for quadrature points; measured up to 1.5, since only a few depths are sampled
 OCCLUSION = 1.3  # ratio of occlusion's error to the prediction for scatter; measured up to 1.1, before SAFETY
 OCCLUSION_WINDOW = 1.3  # the same ratio for windows
 ORDER_ERROR = 4e-3  # of occlusion, relative to the contrast, per radian between linear layers; measured up to 1.9e-3
@@ -286,7 +286,7 @@ class PlannedScene:
     def _share_in_frame(self) -> float:
         """Least share of a PSF inside the image, averaged over pixels; 1 unless occlusion has the border ``"zero"``.
 
-        Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers the image alone: in a tiny image
+        Occlusion divides by the cumulative alpha. With the border ``"zero"`` it covers only the image: in a tiny image
         PSFs are renormalised by the small share inside it, and their errors grow likewise.
         """
         if not self._occlusion or self.planner.border != "zero":

@@ -73,7 +73,7 @@ class PSFSamples:
     def wavelength_counts(self) -> tuple[int, ...]:
         """Return the candidate numbers of binned wavelengths, ascending; none with one wavelength per channel.
 
-        One wavelength per channel is a model of its own, not a sample of a broader spectrum.
+        One wavelength per channel is a separate model, not a sample of a broader spectrum.
         """
         single = all(sum(weight > 0 for weight in row) == 1 for row in self.spectrum.weights)
         return () if single else wavelength_steps(self._fewest, len(self.spectrum.wavelengths))
@@ -130,7 +130,7 @@ class PSFSamples:
 
     @remembered
     def _sampling(self, window: int) -> PSFModel:
-        """Return a model of PSFs between which layers are compared; a copy has a memory of its own."""
+        """Return the model of the compared PSFs; a copy has its own memory."""
         model = self._model(window, _TOLERANCE, max(self._fewest, _WAVELENGTHS))
         return model.without_memory() if window > _LARGEST_REMEMBERED else copy(model)
 

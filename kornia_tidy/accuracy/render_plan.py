@@ -13,17 +13,17 @@ class RenderPlan:
 
     Args:
         fidelity: the settings, for ``optics.with_fidelity(plan.fidelity)``. The window is fixed, but for rays.
-        reference: what the error refers to: the preset ``reference``, with the window of the current masks.
+        reference: of the error: the preset ``reference``, with the window of the current masks.
         tolerance: largest error allowed.
         predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
             an upper estimate, see :mod:`kornia_tidy.accuracy.planner` for its assumptions.
-        error_parts: contributions to ``predicted_error``, by name of what is approximated.
+        error_parts: contributions to ``predicted_error``, by the name of the approximation.
         operations: of one capture with its PSFs, those of float64 counted twice.
         reference_operations: those of the reference.
         memory_bytes: peak of one capture without gradients, beyond the image.
         layers: PSFs computed for the scene, and those of the camera's whole range.
         window: side of the largest PSF in pixels.
-        wavelengths: computed for each layer, and those of the camera's spectrum, all of which the reference uses.
+        wavelengths: computed for each layer, and those of the camera's spectrum, which the reference uses.
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
         field: places along the picture's height and width at which PSFs are computed. Operations and memory are those
             of one.
@@ -44,7 +44,7 @@ class RenderPlan:
     field: tuple[int, int] = (1, 1)
 
     def __str__(self) -> str:
-        """Describe in words what is computed, what is approximated, and the cost."""
+        """Describe the computation, its approximations and its cost in words."""
         first = f"{self.fidelity.name}: error {self.predicted_error:.1e} of full scale against {self.reference.name}"
         if self.predicted_error > self.tolerance:
             first += f", above the tolerance of {self.tolerance:g}"

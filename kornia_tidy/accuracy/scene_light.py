@@ -37,7 +37,8 @@ def power_spectrum(light: Tensor, border: str, size: int) -> Tensor:
 
     Args:
         light: (B, C, H, W).
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Made-up light counts too.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`. Made-up light also
+            counts.
         size: side N of the frequency grid.
 
     Returns:
@@ -119,7 +120,7 @@ class SceneLight:
     Args:
         power: spectrum of the light, (C, N, N // 2 + 1), see :func:`power_spectrum`.
         psi: (b,) defocus in the scene, ascending.
-        energies: one or more distributions of power, of which the one with the largest error counts. Each has shape
+        energies: one or more distributions of power; the one with the largest error counts. Each has shape
             (C, octaves, b) if the errors of depths add in power (gather), (C, octaves, b, b) if they add in amplitude.
     """
 
@@ -161,7 +162,7 @@ class SceneLight:
 
         Args:
             squares: (C, octaves, b) mean square of the error for light of power one, at the depths ``psi``.
-            alternate: whether changes may have opposite signs at similar depths: then they may be independent too.
+            alternate: whether changes may have opposite signs at similar depths: then they may also be independent.
         """
         for own in self.energies:
             if own.ndim == 3:

@@ -48,15 +48,15 @@ class OpticsTransform(A.DualTransform):
           given is 0. It comes back whether or not the picture is taken.
 
     Raises:
-        ValueError: if there is no depth, the ``Compose`` does not warp depth as a mask or interpolates masks, or the
+        ValueError: if the depth is missing, the ``Compose`` does not warp depth as a mask or interpolates masks, or the
             camera's border is ``"valid"``; if image or depth have masked values, or a depth of whole numbers has no
             scale; as the camera.
 
     Convention:
         - Give ``additional_targets={"depth": "mask"}`` to ``Compose``: else its flips would flip the image and not the
-          depth. That is refused. Where holes are filled, give it ``"valid": "mask"`` too.
-        - Give ``Compose`` no masked arrays of NumPy, whose mask it drops, but ``depth.filled(0)``: zeros are holes.
-        - Noise and draws follow from the seed of ``Compose``. The generator of torch is left as it is.
+          depth. That is refused. Where holes are filled, also give it ``"valid": "mask"``.
+        - ``Compose`` drops the mask of a masked array: give it ``depth.filled(0)``, since zeros are holes.
+        - Noise and draws follow from the seed of ``Compose``. The generator of torch does not change.
 
     Example:
         >>> chain = A.Compose([A.HorizontalFlip(), OpticsTransform()], additional_targets={"depth": "mask"}, seed=3)

@@ -52,8 +52,8 @@ def simulate(
     Args:
         image: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8 or uint16 in the range of the type,
             or float32 in [0, 1]. Encoded as sRGB, or as the camera's colour space has it.
-        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. Holes are 0 or less, NaN, and what
-            is masked in a masked array.
+        depth: (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1); integers or floats. Holes are 0 or less, NaN, and
+            masked values.
         depth_scale: metres per unit of the depth; 0.001 for millimetres, where Open3D and ROS say 1000. Integers need
             it; default of floats: 1.
         optics: the camera. Default: ``TiDyOptics`` with five random masks, the same ones in every call.
@@ -66,7 +66,7 @@ def simulate(
         The capture, in the layout, data type and colour order of the image; integers are rounded.
 
     Raises:
-        TypeError: if an argument is no array, or of another data type.
+        TypeError: if an argument is not an array, or has another data type.
         ValueError: if shapes do not fit, a value is out of range, a depth is not positive, integers come without
             ``depth_scale``, it is units per metre, or the image is a masked array with masked values.
 
@@ -107,9 +107,9 @@ def reconstruct(
 
     Args:
         capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
-        system: the trained system: a name of :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or what
-            :func:`~kornia_tidy.reconstruction.hub.from_pretrained` takes or returns. For many calls with a system of
-            your own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.
+        system: the trained system: a name of :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or an argument
+            or result of :func:`~kornia_tidy.reconstruction.hub.from_pretrained`. For many calls with a system of your
+            own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.
         color: order of the three channels of capture and image.
         linear: True if captures hold linear light, False if they are encoded as sRGB.
         memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
@@ -118,7 +118,7 @@ def reconstruct(
         Image and depth, None for a map that the system was not trained for.
 
     Raises:
-        TypeError: if an argument is no array, or of another data type.
+        TypeError: if an argument is not an array, or has another data type.
         ValueError: if the shape or a value is not as above.
 
     Example:
@@ -150,7 +150,7 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
         light: whether floats above 1 are allowed, as linear light may be.
 
     Raises:
-        TypeError: if it is no array, or of another data type.
+        TypeError: if it is not an array, or has another data type.
         ValueError: if the shape or a value is not allowed.
 
     Example:
@@ -188,7 +188,7 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
         depth_scale: metres per unit. None: floats are metres.
 
     Raises:
-        TypeError: if it is no array of integers or floats.
+        TypeError: if it is not an array of integers or floats.
         ValueError: if the shape is not allowed, integers come without a scale, or it is units per metre.
 
     Example:

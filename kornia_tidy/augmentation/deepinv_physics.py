@@ -24,7 +24,7 @@ class CameraPhysics(LinearPhysics):
     Args:
         optics: the camera, gather or scatter.
         depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
-        holes: as for :class:`~kornia_tidy.augmentation.LinearCamera`, whose ``valid`` is ``physics.camera.valid``.
+        holes: as for :class:`~kornia_tidy.augmentation.LinearCamera`; the mask is ``physics.camera.valid``.
         options: of ``deepinv.physics.LinearPhysics``, such as ``noise_model=deepinv.physics.GaussianNoise(0.01)``.
 
     Raises:
@@ -32,7 +32,7 @@ class CameraPhysics(LinearPhysics):
         ValueError: as :class:`~kornia_tidy.augmentation.LinearCamera`.
 
     Convention:
-        - Images are linear light, (B, C, H, W). The sensor of the camera is left out: ``noise_model`` stands for it.
+        - Images are linear light, (B, C, H, W). The sensor of the camera is left out: ``noise_model`` replaces it.
 
     Example:
         >>> import torch

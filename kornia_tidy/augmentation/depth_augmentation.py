@@ -32,7 +32,7 @@ class DepthTap(K.IntensityAugmentationBase2D):
         mask: which of the container's masks is the depth, if it has several: 0 for the first. None: there is one.
 
     Raises:
-        ValueError: when the augmentation asks, if there is no mask, if there are several and none is named, if depth
+        ValueError: when the augmentation asks, if the mask is missing, if there are several and none is named, if depth
             came in half precision, or if another child stands between tap and augmentation.
 
     Example:
@@ -56,14 +56,14 @@ class DepthTap(K.IntensityAugmentationBase2D):
     def apply_transform(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Return the image as it is, and forget the masks of the call before."""
+        """Return the image unchanged, and forget the masks of the call before."""
         self.image, self.version, self.masks = input, input._version, []
         return input
 
     def apply_transform_mask(
         self, input: Tensor, params: dict[str, Tensor], flags: dict[str, Any], transform: Tensor | None = None
     ) -> Tensor:
-        """Return the mask as it is, and keep it for the next child."""
+        """Return the mask unchanged, and keep it for the next child."""
         self.masks.append(input)
         return input
 
@@ -123,7 +123,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         holes: ``"fill"`` fills holes of the depth of the images that are changed; ``"error"`` refuses them.
 
     Raises:
-        TypeError: if ``p`` is no number.
+        TypeError: if ``p`` is not a number.
         ValueError: if ``p`` is not from 0 to 1, or ``holes`` is another word.
 
     Shape:
@@ -152,7 +152,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         Args:
             image: (B', C, H, W).
             depth: (B', 1, H, W) or (1, 1, H, W), float32 or float64.
-            params: what was drawn for these rows, each (B', ...).
+            params: the draws of these rows, each (B', ...).
         """
 
     def forward(  # ty: ignore[incompatible-method-override]
@@ -168,7 +168,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
 
         Raises:
             TypeError: if the image is a sample of several parts, or the depth is not a floating-point tensor.
-            ValueError: if there is no depth, or it does not fit.
+            ValueError: if the depth is missing, or it does not fit.
         """
         if not isinstance(input, Tensor):
             raise TypeError(
@@ -232,7 +232,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
 
 @contextmanager
 def bound_depth(container: nn.Module, depth: Tensor) -> Generator[None]:
-    """Give a depth map to the augmentations in a container that is called with the image alone.
+    """Give a depth map to the augmentations in a container that passes on only the image.
 
     Args:
         container: ``ImageSequential``, ``VideoSequential`` or ``nn.Sequential`` with augmentations that read depth.
@@ -288,7 +288,7 @@ def moves_pixels(module: nn.Module) -> bool:
 
 
 def depth_of_frames(container: nn.Module, depth: Tensor) -> Tensor:
-    """Return the depth of a video as that of a batch of frames, (B T, 1, H, W); other depths as they are.
+    """Return the depth of a video as that of a batch of frames, (B T, 1, H, W); other depths unchanged.
 
     Args:
         container: its ``data_format`` tells which axis is time.

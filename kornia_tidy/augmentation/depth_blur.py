@@ -77,7 +77,7 @@ def depth_blur(
         pixel_pitch: metres.
         max_radius: pixels; larger discs are taken as this one.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``, see :func:`kornia_tidy.render.render`.
-        color_space: ``"srgb"`` is decoded to linear light and encoded after; ``"linear"`` is blurred as it is.
+        color_space: ``"srgb"`` is decoded to linear light and encoded after; ``"linear"`` is blurred directly.
 
     Returns:
         The blurred images: shape and type of ``image``, computed in float32 or better. Gradients reach image and depth.
@@ -228,7 +228,7 @@ class RandomDepthBlur(DepthAugmentation):
 
     Raises:
         TypeError: if a range is not two numbers.
-        ValueError: if a range is empty or out of what a lens can be; on use, as :func:`depth_blur`.
+        ValueError: if a range is empty or impossible for a lens; on use, as :func:`depth_blur`.
 
     Convention:
         - Values are uniform in their ranges, and held in ``_params`` for ``params=``. Nothing else is random.

@@ -118,7 +118,7 @@ class PhaseJitter(Modulator):
         return getattr(self.modulator, "fill_factor", 1.0)
 
     def timeline(self, phase: Tensor) -> Timeline:
-        """Return what the modulator shows of the masks with their errors."""
+        """Return the states and weights of the masks with their errors."""
         error = torch.randn(phase.shape, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64)
         return timeline_of(self.modulator, phase + self.sigma * error.to(phase))
 
@@ -127,7 +127,7 @@ class RowSensors(nn.Module):
     """A sensor whose exposure, noise level and noise differ from image to image of a batch.
 
     Args:
-        sensor: that of the camera; None records light as it is.
+        sensor: that of the camera; None records light without noise.
         params: ``"seed"`` of each image's noise, and, where they were drawn, ``"exposure"``, a factor of light, and
             ``"noise_level"``, the standard deviation of the read noise in units of full scale. Each (B,).
 
@@ -135,7 +135,7 @@ class RowSensors(nn.Module):
         - irradiance: (B, C, H, W), to the same shape.
 
     Convention:
-        - Each image has a generator of its own on the CPU: its noise depends neither on the batch nor on the device.
+        - Each image has its own generator on the CPU: its noise depends neither on the batch nor on the device.
         - One object is for one capture: an image that comes in bands continues its generator.
     """
 
@@ -154,7 +154,7 @@ class RowSensors(nn.Module):
         generator: torch.Generator | None = None,
         origin: tuple[int, int] = (0, 0),
     ) -> Tensor:
-        """Return what the sensors record. ``params`` and ``generator`` are not for rows with their own noise."""
+        """Return the record of each sensor. ``params`` and ``generator`` are not for rows with their own noise."""
         rows = []
         for row, light in enumerate(irradiance.split(1)):
             seen = light if self.exposures is None else light * self.exposures[row]
@@ -167,7 +167,7 @@ def sensor_with(sensor: nn.Module | None, noise_level: float | None) -> nn.Modul
     """Return a sensor like this one with another standard deviation of the read noise.
 
     Raises:
-        TypeError: if the sensor is no SensorNoise.
+        TypeError: if the sensor is not a SensorNoise.
 
     Example:
         >>> sensor_with(SensorNoise(0.01, bits=8), 0.02)

@@ -26,7 +26,7 @@ class LinearCamera(nn.Module):
     Colour spaces and the sensor, which are not linear, are left out: images are linear light.
 
     Args:
-        optics: the camera, gather or scatter. It is shared: A is that of its masks as they are at each call.
+        optics: the camera, gather or scatter. It is shared: A follows its masks at each call.
         depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
             does; ``"error"`` leaves them to the camera. :attr:`valid` is False where they were.
@@ -36,7 +36,7 @@ class LinearCamera(nn.Module):
         - ``camera.adjoint(y)``: the irradiance's shape to that of the light.
 
     Raises:
-        TypeError: if ``optics`` is no camera, or the depth is not a floating-point tensor.
+        TypeError: if ``optics`` is not a camera, or the depth is not a floating-point tensor.
         ValueError: if compositing is occlusion, which is not linear, the spectrum has a basis, or a depth is not
             positive; on use, if an image has another size or batch than the depth.
 

@@ -28,9 +28,9 @@ class OpticsPipeline(nn.Module):
             :class:`~kornia_tidy.augmentation.SceneGeometry`. None: no warp.
         optics: :class:`~kornia_tidy.TiDyOptics`, or an augmentation that reads depth, such as
             :class:`~kornia_tidy.augmentation.RandomTiDyOptics`. Default: ``TiDyOptics()``.
-        photometry: augmentations that move no pixel, for the image alone. None: none.
+        photometry: augmentations that move no pixel, for the image only. None: none.
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
-            does; ``"error"`` leaves them to the optics. Geometry fills those that it meets or makes.
+            does; ``"error"`` leaves them to the optics. Geometry fills its own holes.
 
     Shape:
         - ``pipeline(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to image and depth.
@@ -48,7 +48,7 @@ class OpticsPipeline(nn.Module):
         KeyError: if a mapping has no image or no depth.
 
     Convention:
-        - The depth that comes out is that of the geometry alone, with holes filled. It keeps its type, which should be
+        - The returned depth is warped by the geometry, with holes filled. It keeps its type, which should be
           float32, whatever the image's is.
         - A mapping's masks, boxes and keypoints are warped too, by the names that kornia knows; ``"valid"``, and
           ``"mask"`` if it is bool, tell where the depth is valid.

@@ -18,8 +18,8 @@ class PipelineTransform(DatasetTransform):
         optics: the pipeline.
         seed: None draws from the global generator of torch, which differs from worker to worker. A number gives each
             item its own draws, the same for any number of workers, for fork and spawn, and in every epoch.
-        key: with a seed, what tells items apart: the name of an entry of the sample, or a function of the sample that
-            returns an integer.
+        key: with a seed, identifies the item: the name of an entry of the sample, or a function from the sample to an
+            integer.
 
     Raises:
         KeyError: if a seed is set and the sample has no such entry.

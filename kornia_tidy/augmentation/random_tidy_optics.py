@@ -22,10 +22,10 @@ _OF_OPTICS = ("focus_distance", "aperture_diameter", "mask_jitter", "switching_t
 
 
 class RandomTiDyOptics(DepthAugmentation):
-    r"""Capture images with a programmable camera whose settings are drawn at random for each image.
+    r"""Capture images with a programmable camera; each image has random settings.
 
     Args:
-        optics: the camera. Default: :class:`~kornia_tidy.TiDyOptics` as it comes. Gradients reach its masks.
+        optics: the camera. Default: ``TiDyOptics()``. Gradients reach its masks.
         exposure: range of the factor of light before the sensor; 1 leaves it.
         focus_distance: range in metres.
         aperture_diameter: range in metres. The light of the image stays the same, as with automatic exposure.
@@ -47,7 +47,7 @@ class RandomTiDyOptics(DepthAugmentation):
 
     Raises:
         TypeError: if the camera lacks the part that a range is for.
-        ValueError: if a range is empty or out of what the camera allows, ``p`` is not from 0 to 1, or the camera's
+        ValueError: if a range is empty or outside the camera's limits, ``p`` is not from 0 to 1, or the camera's
             border is ``"valid"``, which gives smaller images; on use, as :class:`~kornia_tidy.TiDyOptics`.
 
     Convention:
@@ -56,13 +56,13 @@ class RandomTiDyOptics(DepthAugmentation):
           which noise and phase errors follow: the same ``params`` give the same bits.
         - Draws come from the global generator of torch, as kornia's do.
         - Depth is read in float32 or better, whatever the image's type.
-        - Images with the same lens are captured together; each other lens takes PSFs of its own. So
+        - Images with the same lens are captured together; each other lens has its own PSFs. So
           ``focus_distance``, ``aperture_diameter``, ``mask_jitter`` and ``switching_time`` cost more than ``exposure``
           and ``noise_level``.
         - Matrices of drawn lenses are remembered as those of other lenses are, in 256 MiB for each process at most.
         - Behind a lens each image is a crop from a place that is drawn over the lens's field, as far out as its corners
-          allow, unless the camera's ``field_center`` or the geometry of a pipeline says the place. Each place takes
-          PSFs of its own, about a second; ``same_on_batch`` shares them.
+          allow, unless the camera's ``field_center`` or the geometry of a pipeline says the place. Each place has its
+          own PSFs, which take about a second; ``same_on_batch`` shares them.
         - Compiled graphs call it eagerly.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023, for the camera.

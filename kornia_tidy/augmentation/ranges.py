@@ -43,7 +43,7 @@ def check_probability(p: float) -> None:
     """Raise unless a number is a probability.
 
     Raises:
-        TypeError: if it is no number.
+        TypeError: if it is not a number.
         ValueError: if it is not from 0 to 1.
     """
     check_number("p", p)

@@ -1,4 +1,4 @@
-"""Rows of a batch: an augmentation computes those that it changes, each with draws and noise of its own."""
+"""Rows of a batch: an augmentation computes only the changed ones, each with its own draws and noise."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def changed_rows(
     every: bool,
     change: Callable[[Tensor | slice, dict[str, Tensor]], Tensor],
 ) -> Tensor:
-    """Return a batch of which some images were changed. The others are not computed.
+    """Return a batch with some images changed. The others are not computed.
 
     Args:
         image: (B, C, H, W).
         params: of an augmentation of kornia; ``"batch_prob"`` above 0.5 marks the images to be changed.
         every: change all of them, whatever ``"batch_prob"`` says.
-        change: takes the indices of images and what was drawn for them, and returns the changed images.
+        change: takes the indices of images and their draws, and returns the changed images.
 
     Example:
         >>> params = {"batch_prob": torch.tensor([0.0, 1.0]), "by": torch.tensor([1.0, 2.0])}

@@ -45,8 +45,8 @@ class Scene(NamedTuple):
 class SceneGeometry(nn.Module):
     r"""Warp images and their depth by the same geometric augmentations of kornia.
 
-    Depth is resampled by the nearest pixel, so that no depth between two things arises. What comes from beyond the
-    image, at the corners of a rotation, is a hole: filled from the nearest valid pixel, and False in the mask.
+    Depth is resampled by the nearest pixel, so that no depth between two things arises. Pixels from beyond the image,
+    as at the corners of a rotation, are holes: filled from the nearest valid pixel, and False in the mask.
 
     Args:
         augmentations: of kornia, one after another, or one ``AugmentationSequential``.
@@ -57,7 +57,7 @@ class SceneGeometry(nn.Module):
         - ``geometry(image, depth, valid=None)`` to a :class:`Scene`; each input batched, or all without B.
 
     Raises:
-        TypeError: if an augmentation is no module of kornia's that warps masks with the image.
+        TypeError: if an augmentation is not a module of kornia's that warps masks with the image.
         ValueError: if masks would be interpolated, or, on use, ``scale_depth`` meets a warp that is not affine, or a
             whole map of depth is left without a valid pixel.
 
@@ -149,7 +149,7 @@ class SceneGeometry(nn.Module):
         Args:
             before: the images that were given.
             after: the images that came out.
-            center: where the middle of those that were given lies, (2,) or (B, 2): y and x in pixels.
+            center: middle of the given images, (2,) or (B, 2): y and x in pixels.
 
         Returns:
             (B, 2) float64 on the CPU, y and x in pixels of the images that came out; (2,) for unbatched ones.
@@ -202,7 +202,7 @@ def warped_entries(sample: Mapping[str, Any], taken: tuple[str, ...]) -> dict[st
         taken: names of image, depth and valid mask.
 
     Raises:
-        ValueError: if an entry has the size of the image and a name by which kornia does not know it: it would pass
+        ValueError: if an entry has the size of the image and a name that kornia does not know: it would pass
             unwarped.
 
     Example:

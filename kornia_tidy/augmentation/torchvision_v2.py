@@ -1,4 +1,4 @@
-"""torchvision v2: depth as a tensor type of its own, and the camera as a transform of samples of any structure.
+"""torchvision v2: depth as a tensor type, and the camera as a transform of samples of any structure.
 
 Needs torchvision 0.22 or newer; nothing else of the package imports it.
 """
@@ -30,7 +30,7 @@ class Depth(tv_tensors.Mask):
     """A depth map among the tensor types of torchvision: warped like a mask, and left alone by photometric transforms.
 
     Convention:
-        - Resampled by the nearest pixel. What comes from beyond the image is 0, a hole, whatever ``fill`` says.
+        - Resampled by the nearest pixel. Pixels from beyond the image are 0, a hole, for any ``fill``.
         - (1, H, W), or (T, 1, H, W) beside a video.
 
     Example:
@@ -42,7 +42,7 @@ class Depth(tv_tensors.Mask):
 
 
 class Valid(tv_tensors.Mask):
-    """Where a depth map was known, bool: warped with the :class:`Depth`, and False beyond the image, too."""
+    """Where a depth map was known, bool: warped with the :class:`Depth`, and also False beyond the image."""
 
 
 def _register_kernels() -> None:
@@ -74,7 +74,7 @@ class OpticsTransform(v2.Transform):
 
     Shape:
         - Any structure with one :class:`Depth` and one or more images of its size: ``tv_tensors.Image``, a PIL image, a
-          ``tv_tensors.Video`` with a depth of each frame, or a plain tensor if there is none of these. Images come back
+          ``tv_tensors.Video`` with a depth of each frame, or else a plain tensor. Images come back
           in the type in which they came, 8-bit ones rounded; all else as it was.
 
     Raises:
@@ -130,7 +130,7 @@ class OpticsTransform(v2.Transform):
         return {"depth": depth_tensor(depths[0], self.depth_scale)}
 
     def transform(self, entry: Any, params: dict[str, Any]) -> Any:
-        """Return the capture of an image, and all else as it is."""
+        """Return the capture of an image, and everything else unchanged."""
         if not _is_image(entry):
             return entry
         plain = entry.as_subclass(Tensor) if isinstance(entry, Tensor) else entry

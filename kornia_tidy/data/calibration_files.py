@@ -25,8 +25,8 @@ def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
         Options by name: pixels and metres.
 
     Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if an entry is missing, or is no number of the kind.
+        FileNotFoundError: if the file is missing.
+        ValueError: if an entry is missing or has another type.
 
     Source: Scharstein et al., High-Resolution Stereo Datasets with Subpixel-Accurate Ground Truth (GCPR 2014).
 

@@ -26,7 +26,7 @@ SMALLEST_LEAF = 1.0  # px: a smaller leaf would fall between pixels
 MOST_FAR = 3.0  # largest exponent of normalised inverse depth; drawn from 1 to this, uniform in its logarithm
 LARGEST_SLANT = 0.08  # fraction of the dioptre range, from the middle of a leaf to its edge
 OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6, so that every corner of a polygon is a point
-PEN = 0.6  # px by which cv2.fillPoly grows a shape: it fills every pixel that the outline touches
+PEN = 0.6  # px by which cv2.fillPoly grows a shape, since it fills every pixel on the outline
 SUBPIXEL_BITS = 4  # cv2 draws with fixed-point coordinates
 
 

@@ -63,14 +63,14 @@ def read_depth(
         focal_px: f, focal length in pixels; disparity and distance only.
         baseline_m: B, distance between the two cameras in metres; disparity only.
         doffs_px: d, difference of the principal points in pixels; disparity only.
-        rotated_bits: places by which the bits of stored 16-bit values were rotated to the left; 3 for SUN RGB-D.
+        rotated_bits: number of bits by which stored 16-bit values were rotated to the left; 3 for SUN RGB-D.
 
     Returns:
         The depth and where it is valid, each :math:`(1, H, W)`.
 
     Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if the file is no image, cut short or damaged, or has several channels or no valid pixel; if
+        FileNotFoundError: if the file is missing.
+        ValueError: if the file is not an image, is cut short or damaged, or has several channels or no valid pixel; if
             disparity comes without calibration or depth with one; if a number is not positive; or if the scale is
             units per metre.
 
@@ -223,7 +223,7 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
             scale as a text.
         depth: :math:`(1, H, W)` in metres, positive, may be infinite.
         scale: metres per stored unit; 0.001 lets a PNG hold 1 mm to 65.535 m.
-        saturate: clip depths to what a PNG can hold: its largest number then means *this far or farther*, infinity
+        saturate: clip depths to the range of a PNG: its largest number then means *this far or farther*, infinity
             included, and its smallest, 1, *this near or nearer*. False: other depths raise ``ValueError``.
 
     Raises:

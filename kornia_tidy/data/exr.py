@@ -113,7 +113,7 @@ def _library() -> Any:
 
 
 def _parts(data: bytes, *, header_only: bool) -> list[Any]:
-    """Return the parts of a file; those that are damaged are missing."""
+    """Return the intact parts of a file."""
     library = _library()
     for _ in range(_MOST_TEXTS):
         said = _Said()
@@ -123,7 +123,7 @@ def _parts(data: bytes, *, header_only: bool) -> list[Any]:
                 parts = list(file.parts)
         except MemoryError:
             raise
-        except UnicodeDecodeError as error:  # a text in the header; another encoding is no damage
+        except UnicodeDecodeError as error:  # a text in the header; other encodings are allowed
             before = struct.pack("<i", len(error.object)) + error.object
             data = data.replace(before, before[:4] + b"?" * len(error.object), 1)
             continue
@@ -153,7 +153,7 @@ class _Said(io.TextIOBase):
 
 
 def _header(number: int, header: Mapping[str, Any]) -> _Header:
-    """Return what the header of a part says; a channel without a layer in its name is in that of the part's name."""
+    """Return the values of a part's header; the part's name is the layer of channels that name none."""
     channels = []
     for channel in header["channels"]:
         layer, _, leaf = channel.name.rpartition(".")
@@ -191,7 +191,7 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
     """Return the channel of depth, and those that must be equal to it.
 
     Raises:
-        ValueError: if there is none, or several may be it.
+        ValueError: if no channel fits, or several do.
     """
     if len(channels) == 1:
         return [*channels]
@@ -222,7 +222,7 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
 
 
 def _unclear(reason: str, channels: Sequence[_Channel]) -> ValueError:
-    """Return the error for a file whose depth is not clear."""
+    """Return the error for a file with an ambiguous depth."""
     return ValueError(
         f"which channel of its OpenEXR is depth is not clear, {reason}: of {_listed(channels)} write it alone to a file"
     )

@@ -41,7 +41,7 @@ class FlyingThings3D(SceneDataset):
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
-        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message names the download and its folder.
         ValueError: if frames have no disparity, or an argument is not as above.
 
     Convention:
@@ -174,7 +174,7 @@ def paper_patches(
         A data set for a camera of ``DefocusRange(-20, 20)``.
 
     Raises:
-        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message names the download and its folder.
         ValueError: if frames have no disparity, or an argument is not as above.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3; Shah et al., TiDy-PSFs (ICCV 2023), section 5.
@@ -200,7 +200,7 @@ def _check_disparity_range(disparity_range: tuple[float, float], baseline_m: flo
 
 
 def _frames_folder(root: Path, frames: str) -> tuple[Path, str]:
-    """Return the folder of the frames and their suffix; PNG, if WebP is there too."""
+    """Return the folder of the frames and their suffix; PNG is preferred to WebP."""
     for folder, suffix in ((root / f"frames_{frames}", ".png"), (root / f"frames_{frames}_webp", ".webp")):
         if folder.is_dir() and (root / "disparity").is_dir():
             return folder, suffix

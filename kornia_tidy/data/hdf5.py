@@ -24,7 +24,8 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
 
     Raises:
         ImportError: if h5py is missing.
-        ValueError: if the file is damaged, or holds no data set or several, or one that is no map of numbers in it.
+        ValueError: if the file is damaged, or holds no data set or several, or a data set in it that does not hold a
+            map of numbers.
     """
     try:
         h5py = import_installed("h5py")  # an extra, and slow to import
@@ -45,8 +46,8 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
 def stored_numbers(file: Any, name: str) -> Any:
     """Return a data set of numbers that lie in an open HDF5 file, None if the name is not that of a data set.
 
-    Links to other files, and values in other files, are refused: a file could show what its sender may not read. So are
-    chunks with more numbers than a picture has pixels, which would be decompressed as a whole.
+    Links to other files, and values in other files, are refused: a file could expose data that its sender may not read.
+    So are chunks with more numbers than a picture has pixels, which would be decompressed as a whole.
 
     Raises:
         ValueError: if the data set is such a one, or its values are not numbers.

@@ -35,9 +35,9 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         sRGB).
 
     Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if it is no image, cut short or damaged, has other channels, types or floats outside [0, 1],
-            or needs more memory than there is.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is not an image, is cut short or damaged, has other channels, types or floats outside [0, 1],
+            or needs more memory than the machine has.
 
     Warns:
         UserWarning: if viewers turn the picture, by its EXIF or XMP orientation: once for each folder, size and

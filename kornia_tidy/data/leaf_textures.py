@@ -230,4 +230,4 @@ def _rings(along: Array, across: Array, size: Array, style: Array, tile: Array) 
 TEXTURES: tuple[Callable[[Array, Array, Array, Array, Array], Array], ...] = (
     _plain, _plain, _cloud, _cloud, _veins, _veins, _stripes, _checks, _script, _spots, _rings,
 )  # fmt: skip
-SCRIPT = TEXTURES.index(_script)  # writing is drawn into a tile of its own
+SCRIPT = TEXTURES.index(_script)  # writing is drawn into a separate tile

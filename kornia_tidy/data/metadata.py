@@ -35,7 +35,7 @@ def with_exif(file: bytes, info: Mapping[str, Any]) -> bytes:
         The file, unchanged if ``info`` has none of these.
 
     Raises:
-        ValueError: if it is none of the three formats, or a big-endian TIFF.
+        ValueError: if it has another format, or is a big-endian TIFF.
 
     Source: CIPA DC-008, Exif 2.32, section 4.6; PNG 1.2 extensions 1.5 (``eXIf``); JPEG's APP1; TIFF 6.0, section 2.
     """

@@ -37,7 +37,7 @@ def decode_netpbm(data: bytes) -> tuple[NDArray[Any], int]:
         data: bytes of the file.
 
     Returns:
-        The samples as they are stored, (H, W, C) uint8 or uint16, without alpha; and the maximum, which means white.
+        The stored samples, (H, W, C) uint8 or uint16, without alpha; and the maximum, which means white.
 
     Raises:
         ValueError: if the header is damaged, the picture too large, the file cut short or longer than its picture, a
@@ -154,7 +154,7 @@ def _whole_numbers(text: bytes) -> NDArray[np.uint32]:
             part = part[: 1 + max(part.rfind(blank) for blank in _BLANKS)] or part
         begin += len(part)
         digits = np.frombuffer(part, np.uint8) - np.uint8(ord("0"))  # of a blank: far above 9
-        is_digit = np.append(digits <= 9, False)  # the last stands for what precedes the text, index -1
+        is_digit = np.append(digits <= 9, False)  # the last is the state before the text, at index -1
         last = np.flatnonzero(is_digit[:-1] & ~is_digit[1:])
         values, longer = digits[last].astype(np.uint32), np.arange(len(last))
         for place in range(1, _MOST_DIGITS + 1):

@@ -40,7 +40,7 @@ class NYUDepthV2(SceneDataset):
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
-        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message names the download and its folder.
         ImportError: if h5py is missing.
         ValueError: if a file is damaged or has other contents.
 

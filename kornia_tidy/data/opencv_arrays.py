@@ -24,7 +24,7 @@ def from_opencv(picture: NDArray[Any]) -> Tensor:
         (1, H, W), or (3, H, W) in RGB; float32 in [0, 1].
 
     Raises:
-        TypeError: if it is no array, or of another data type.
+        TypeError: if it is not an array, or has another data type.
         ValueError: if it is of another shape, or a masked array with masked values.
 
     Example:

@@ -61,9 +61,9 @@ def tell_orientation(
 
     Args:
         path: the file.
-        orientation: 1 to 8; there is no warning for 1.
+        orientation: 1 to 8; 1 gives no warning.
         size: rows and columns.
-        of: what the file holds.
+        of: content of the file.
 
     Warns:
         UserWarning: with the operation that makes the other file of a scene fit.
@@ -75,7 +75,7 @@ def tell_orientation(
 
 
 def told(path: str | os.PathLike[str], orientation: int, of: Literal["picture", "depth"] = "picture") -> str:
-    """Return the warning about a file whose orientation is not 1.
+    """Return the warning about a file with another orientation than 1.
 
     Example:
         >>> told("lamp.jpg", 3)

@@ -14,16 +14,16 @@ from kornia_tidy.seeds import item_generator
 
 
 class Patches(Dataset[Any]):
-    """Data set of random patches, whose scenes and places depend on the seed and the index alone.
+    """Data set of random patches, with scenes and places that depend only on the seed and the index.
 
     Args:
-        scenes: a map-style data set whose items are mappings with an ``"image"``: one of this library, or a ``Subset``.
+        scenes: a map-style data set of mappings with an ``"image"``: one of this library, or a ``Subset``.
         size: side of a patch in pixels, or (height, width).
         count: number of patches. Up to ``len(scenes)`` all are from different scenes, in an order drawn by the seed;
             after that scenes are used again, with other windows. Default: one per scene.
         seed: of the windows and of the order of scenes.
         transform: called with each patch. A camera belongs here: as a transform of ``scenes`` it would also photograph
-            what is cropped away.
+            the pixels that are cropped away.
 
     Raises:
         ValueError: if there are no scenes, or a size or the count is not positive.
@@ -95,7 +95,7 @@ def random_crop(
         entries are passed on.
 
     Raises:
-        KeyError: if there is no image.
+        KeyError: if the image is missing.
         ValueError: if the window is larger than the image.
 
     Example:
@@ -123,7 +123,7 @@ def crop(sample: dict[str, Any], top: int, left: int, height: int, width: int) -
     """Crop all maps of a sample to the window at row ``top`` and column ``left``. See :func:`random_crop`.
 
     Raises:
-        KeyError: if there is no image.
+        KeyError: if the image is missing.
         ValueError: if the window does not lie inside the image.
     """
     size = sample["image"].shape[-2:]

@@ -32,7 +32,7 @@ def decode_pfm(data: bytes) -> NDArray[np.float32]:
     Convention:
         - The first row returned is the top one; the first in the file is the bottom one.
         - A negative scale in the header means little-endian. Values are not multiplied by the scale: Middlebury's
-          files have 0.003922, and their values are disparities as they are.
+          files have 0.003922, and their stored values are the disparities.
 
     Source: Debevec, PFM Portable FloatMap Image Format.
 

@@ -31,7 +31,7 @@ DISPLACED_SHARE = 0.5  # share of scenes with outlines of depth beside those of 
 OFFSET = 3.0  # largest offset of depth along rows in pixels, as by the distance between two lenses
 WAVES = (12.0, 40.0)  # pixels between the nodes of a smooth displacement, uniform in its logarithm
 WAVE, RAGGED = 1.5, 0.7  # standard deviations in pixels of that displacement, and of one for each pixel
-GRAINY_SHARE = 0.5  # share of scenes with grain of their own, as pictures of small sensors have
+GRAINY_SHARE = 0.5  # share of scenes with grain, as in pictures of small sensors
 GRAIN = (0.002, 0.012)  # its standard deviation in the encoded picture, uniform in its logarithm
 GRAIN_SIZE = (0.3, 3.0)  # standard deviation in pixels of the blur that made it coarse, uniform in its logarithm
 GRAIN_COLOR = 0.5  # share of its variance that is not common to the colours
@@ -56,10 +56,9 @@ def photo_collage(
     Shapes and depths are those of :func:`~kornia_tidy.data.dead_leaves.dead_leaves`, sampling and softness those of
     :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves`. A scene shows up to four photographs, reduced to
     a third of their sides or more, in one shape for 300 to 40,000 pixels. Shapes differ in exposure, tint and the
-    contrast of their texture; a fifth has none, only the light around it. Depth has nothing to do with what the
-    photographs show, so that a network can learn it from defocus alone. In half of the scenes outlines of depth lie
-    some pixels beside those of the image, as in the depth maps of sensors, and half have grain, as pictures of small
-    sensors.
+    contrast of their texture; a fifth has none, only the light around it. Depth is independent of the photographs'
+    content, so that a network can learn it only from defocus. In half of the scenes outlines of depth lie some pixels
+    beside those of the image, as in the depth maps of sensors, and half have grain, as pictures of small sensors.
 
     Args:
         photographs: paths of files that :func:`~kornia_tidy.data.image_files.read_image` reads, in sRGB, all of them
@@ -74,7 +73,7 @@ def photo_collage(
 
     Raises:
         FileNotFoundError: if a photograph that the scene shows is missing.
-        ValueError: if there is no photograph or one cannot be read, or as
+        ValueError: if the photographs are missing or one cannot be read, or as
             :func:`~kornia_tidy.data.photographic_leaves.photographic_leaves` does.
 
     Convention:
@@ -184,7 +183,7 @@ def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:
         folder: where to look; hidden files are passed by.
 
     Raises:
-        FileNotFoundError: if there is no such folder, or none of these files in it.
+        FileNotFoundError: if the folder is missing or holds none of these files.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -246,7 +245,7 @@ def grain(height: int, width: int, rng: Generator) -> NDArray[np.float32]:
 def _collage(
     index: NDArray[np.int32], photographs: Sequence[str | os.PathLike[str]], rng: Generator
 ) -> NDArray[np.float32]:
-    """Return the linear light of leaves, (H, W, 3), each of which shows its place in one of a few photographs."""
+    """Return the linear light of leaves, (H, W, 3); each leaf shows its place in one of a few photographs."""
     shown = rng.choice(len(photographs), min(len(photographs), 1 + rng.integers(MOST_PHOTOGRAPHS)), replace=False)
     leaves = int(index.max()) + 1
     photograph = rng.integers(len(shown), size=leaves)

@@ -1,7 +1,7 @@
 """Size, completeness and kind of a picture file, checked before OpenCV decodes it.
 
 Decoders allocate memory for the size in the header, and some fill missing parts with grey without an error. OpenCV
-cannot read a header alone. Kinds that it does not decode, or changes, are refused by their names.
+cannot read only a header. Kinds that it does not decode, or changes, are refused by their names.
 
 Source: PNG 3, sections 5 and 11; ITU-T T.81 (JPEG), annex B; Microsoft's BITMAPINFOHEADER and BITMAPV4HEADER;
 RFC 9649 (WebP).
@@ -170,7 +170,7 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _bmp(data: bytes) -> Size:
-    """Return the size of a BMP; refuse kinds whose colours OpenCV takes for others."""
+    """Return the size of a BMP; refuse kinds with colours that OpenCV confuses."""
     (length,) = struct.unpack_from("<I", data, 14)
     columns, rows, _, bits = struct.unpack_from("<HHHH" if length == 12 else "<iiHH", data, 18)
     coding = 0 if length == 12 else struct.unpack_from("<I", data, 30)[0]

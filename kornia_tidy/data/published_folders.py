@@ -27,7 +27,7 @@ def middlebury(root: str | os.PathLike[str], transform: Transform | None = None)
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        FileNotFoundError: if the folder is missing, or holds no data of this layout.
         ValueError: if an image has no depth, or depth no image.
 
     Convention:
@@ -48,7 +48,7 @@ def seven_scenes(root: str | os.PathLike[str], transform: Transform | None = Non
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        FileNotFoundError: if the folder is missing, or holds no data of this layout.
         ValueError: if an image has no depth, or depth no image.
 
     Convention:
@@ -69,7 +69,7 @@ def scannet(root: str | os.PathLike[str], transform: Transform | None = None) ->
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        FileNotFoundError: if the folder is missing, or holds no data of this layout.
         ValueError: if an image has no depth, or depth no image.
 
     Convention:
@@ -90,13 +90,13 @@ def kitti(root: str | os.PathLike[str], transform: Transform | None = None) -> R
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        FileNotFoundError: if the folder is missing, or holds no data of this layout.
         ValueError: if an image has no depth, or depth no image.
 
     Convention:
         Stored values are metres times 256, and 0 is unknown. The mask is True where the laser measured. Everything
         else is filled, see :func:`~kornia_tidy.data.guided_fill.fill_guided`; the sky above the laser's reach gets the
-        depth of what is below it.
+        depth of the pixels below it.
 
     Source: Uhrig et al., Sparsity Invariant CNNs (3DV 2017).
     """
@@ -115,7 +115,7 @@ def hypersim(root: str | os.PathLike[str], transform: Transform | None = None) -
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, or nothing in it has this layout.
+        FileNotFoundError: if the folder is missing, or holds no data of this layout.
         ValueError: if an image has no depth, or depth no image; on reading, if the sides of a frame are not 4 : 3.
 
     Convention:
@@ -131,7 +131,7 @@ def hypersim(root: str | os.PathLike[str], transform: Transform | None = None) -
 
 
 class _Hypersim(RGBDFolder):
-    """Frames whose stored distance along the ray is converted to depth."""
+    """Frames with a stored distance along the ray, which is converted to depth."""
 
     def read(self, index: int) -> Scene:
         """Read a pair."""

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset
 class Remembered(Dataset):
     """Data set that caches the items of another one, up to a limit of memory.
 
-    For items that depend on their index alone, such as painted scenes. Each worker of a loader has its own cache.
+    For items that depend only on their index, such as painted scenes. Each worker of a loader has its own cache.
 
     Args:
         scenes: a map-style data set of mappings.

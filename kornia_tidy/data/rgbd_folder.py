@@ -27,23 +27,23 @@ class RGBDFolder(SceneDataset):
     Args:
         root: the folder.
         image: pattern of the images' paths in the folder. Each ``*`` matches one or more characters other than ``/``;
-            everything else is literal. Hidden files, whose names begin with a dot, are passed by.
+            everything else is literal. Hidden files, whose names begin with a dot, are ignored.
         depth: pattern of the depth files. Image and depth are a pair if every ``*`` matches the same in both.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
         calibration: pattern of the file with the calibration of each pair, see
-            :func:`~kornia_tidy.data.calibration_files.read_calibration`. Its ``*`` are what the first ones of the pair
-            match; there may be fewer. What it holds goes before ``options``.
+            :func:`~kornia_tidy.data.calibration_files.read_calibration`. Its ``*`` take the text that the first ones of
+            the pair match; there may be fewer. Its values override ``options``.
         **options: how depth is stored and joined with the image, see :func:`~kornia_tidy.data.rgbd.read_rgbd` and
             :func:`~kornia_tidy.data.depth_files.read_depth`.
 
     Raises:
-        FileNotFoundError: if there is no folder, no file fits a pattern, or a calibration is missing.
+        FileNotFoundError: if the folder is missing, no file fits a pattern, or a calibration is missing.
         ValueError: if a file has no partner; if a pattern has no ``*``, another number of them than the other one, or
             leads out of the folder; or if the options contradict each other.
 
     Convention:
-        - Items are sorted by name; a name is what the ``*`` match, joined by ``/``. Names are compared as text, as in
-          torchvision's ``ImageFolder``: ``frame10`` comes before ``frame2``. Number frames with leading zeros where
+        - Items are sorted by name; a name joins the texts that the ``*`` match by ``/``. Names are compared as text, as
+          in torchvision's ``ImageFolder``: ``frame10`` comes before ``frame2``. Number frames with leading zeros where
           their order matters.
         - A file that matches both patterns belongs to the longer one, so that ``"*.png"`` and ``"*_depth.png"`` may lie
           in one folder.
@@ -126,7 +126,7 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`.
 
     Raises:
-        FileNotFoundError: if there is no folder, no ``rgbd.json`` in it, or no file fits a pattern.
+        FileNotFoundError: if the folder or its ``rgbd.json`` is missing, or no file fits a pattern.
         ValueError: if ``rgbd.json`` is not as above, or as :class:`RGBDFolder` does.
 
     Example:

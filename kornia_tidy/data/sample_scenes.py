@@ -82,7 +82,7 @@ def sample_scene(name: str = "table", height: int = 480) -> Scene:
         the optical axis; and the mask of valid depth, True everywhere. Each call returns the same scene.
 
     Raises:
-        ValueError: if there is no scene of that name, or the height is not a positive integer.
+        ValueError: if no scene has that name, or the height is not a positive integer.
 
     Convention:
         As :func:`~kornia_tidy.data.photographic_leaves`: painted at twice the size and averaged in linear light; depths

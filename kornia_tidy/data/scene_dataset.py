@@ -25,12 +25,12 @@ class SceneDataset(Dataset[Any]):
     """Base class of the data sets of scenes.
 
     A subclass defines the number of scenes (``__len__``), the name of a scene (:meth:`name`) and how it is read
-    (:meth:`read`). Items depend on their index alone: they are the same in every epoch and for any number of workers,
+    (:meth:`read`). Items depend only on their index: they are the same in every epoch and for any number of workers,
     forked or spawned. No file stays open between items.
 
     Args:
         transform: called with each sample, for example ``optics.as_transform(seed=0)``. Default: samples are
-            returned as they are.
+            returned unchanged.
 
     Convention:
         An item is a mapping that :class:`~kornia_tidy.TiDyOptics` takes and a data loader collates:
@@ -64,7 +64,7 @@ class SceneDataset(Dataset[Any]):
         """Return one sample; a negative index counts from the end.
 
         Raises:
-            IndexError: if there is no such item.
+            IndexError: if the index is out of range.
             UnreadableItemError: if its file is damaged or missing.
         """
         index = item_index(index, len(self))
@@ -80,7 +80,7 @@ class SceneDataset(Dataset[Any]):
 
 
 def item_index(index: SupportsIndex, length: int) -> int:
-    """Return the index as an int from 0; raise ``IndexError``, which ends Python's loops, if there is no such item."""
+    """Return the index as an int from 0; raise ``IndexError``, which ends Python's loops, if it is out of range."""
     number = operator.index(index)
     if not -length <= number < length:
         raise IndexError(f"item {number} of a data set of {length}")

@@ -83,14 +83,14 @@ class SceneStatistics:
     def cell_power(self, size: int) -> Tensor:
         """Return the variance of light in each cell of a grid of frequencies, that of a square image's transform.
 
-        The zero frequency gets what the other cells leave of the total, as the spectrum may have its knee within one
+        The zero frequency gets the rest of the total, since the spectrum may have its knee within one
         cell.
 
         Args:
             size: side N of the image in pixels.
 
         Returns:
-            (N, N // 2 + 1) float64, for the half spectrum of a real transform. Columns that stand for two frequencies
+            (N, N // 2 + 1) float64, for the half spectrum of a real transform. Columns of two frequencies
             hold the variance of both, so that the sum is the variance of light.
         """
         down, across = torch.fft.fftfreq(size, dtype=torch.float64), torch.fft.rfftfreq(size, dtype=torch.float64)
@@ -106,9 +106,9 @@ class SceneStatistics:
         .. math:: w(r) = \frac{\langle a(x_p) \, x_{p+r} \rangle}{\langle a \rangle \langle x \rangle}
                   \approx 1 - (1 - w_0) \, e^{-(r / r_0)^{3/4}}
 
-        a is the squared slope of the sRGB curve, the factor by which an error in linear light counts. It is large in
-        dark pixels, and light near to them is dim too. So what a pixel gets from far away, as from the halo of a wide
-        PSF, counts more than what it gets from its neighbours.
+        a is the squared slope of the sRGB curve, the weight of an error in linear light. It is large in
+        dark pixels, and light near them is also dim. Light from far away, as in the halo of a wide PSF, therefore
+        counts more than light from neighbours.
 
         Args:
             distance: r in pixels, any shape.

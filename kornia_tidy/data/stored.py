@@ -34,7 +34,7 @@ _GREY, _PALETTE, _GREY_AND_ALPHA = 0, 3, 4  # colour types of PNG
 
 
 class Stored(NamedTuple):
-    """Numbers of an image file, without any conversion, and what the file says of them."""
+    """Numbers of an image file, without any conversion, and their description in the file."""
 
     values: NDArray[Any]
     """(H, W, C) in the data type of the file, rows and columns as they are stored; channels are grey or R, G, B."""
@@ -58,15 +58,16 @@ def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
 
     Args:
         path: the file.
-        depth: whether depth is wanted. It is taken from the channels of an OpenEXR file, which is no picture of codes;
-            and bitmaps, palettes, and numbers of which 0 is white are refused, since they are colours.
+        depth: whether depth is wanted. It is taken from the channels of an OpenEXR file, which does not store codes;
+            and bitmaps, palettes, and inverted greys are refused, since they are colours.
 
     Returns:
-        The numbers, and what the file says of them; alpha is dropped.
+        The numbers, and their description in the file; alpha is dropped.
 
     Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if it is no regular file, empty, cut short, damaged, of no known format, or has too many pixels.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is not a regular file, is empty, cut short, damaged or of an unknown format, or has too many
+            pixels.
     """
     return decode_stored(read_bytes(path), path, depth=depth)
 
@@ -125,7 +126,7 @@ def _decode(data: bytes, depth: bool) -> Stored:
 
 
 def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:
-    """Undo what OpenCV does to numbers of less than 8 bits and to grey with alpha, and mark transparent depth.
+    """Undo OpenCV's scaling of numbers of less than 8 bits and to grey with alpha, and mark transparent depth.
 
     A file of GDAL marks missing values by the grey level that is transparent.
     """

@@ -1,4 +1,4 @@
-"""SUN RGB-D: indoor frames of four depth cameras, whose 16-bit depth has rotated bits."""
+"""SUN RGB-D: indoor frames of four depth cameras, with rotated bits in the 16-bit depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SUNRGBD(SceneDataset):
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
-        FileNotFoundError: if there is no folder, or it holds no frame.
+        FileNotFoundError: if the folder is missing or holds no frame.
         ValueError: if a frame does not have one image and one depth.
 
     Convention:

@@ -49,7 +49,7 @@ def decode_tiff(
         unknown: (H, W), True where the file says that nothing was measured: by GDAL's missing value, by a mask, by
             transparency or by a strip or tile that is left out. None if it says so nowhere.
         orientation: 1 to 8 as in EXIF.
-        scale: factor for the numbers in GDAL's or ImageJ's metadata; 1 if there is none.
+        scale: factor for the numbers in GDAL's or ImageJ's metadata; 1 without one.
 
     Raises:
         ValueError: if the file is damaged, of a kind that is not read, or holds several pictures or none.
@@ -90,7 +90,7 @@ def decode_tiff(
 
 
 def _photometric(directory: Directory, layout: Layout) -> int:
-    """Return the photometric interpretation; raise ``ValueError`` for those that are not read."""
+    """Return the photometric interpretation; raise ``ValueError`` for unsupported ones."""
     photometric = directory.number(PHOTOMETRIC, _RGB if layout.samples > 2 else _BLACK_IS_ZERO)
     if photometric not in _COLOURS:
         name = _REFUSED.get(photometric, "of an unknown meaning")
@@ -146,7 +146,7 @@ def _scale(directory: Directory) -> float:
     """Return the factor that GDAL or ImageJ gives for the numbers, 1 if they give none.
 
     Raises:
-        ValueError: if they give an offset or a curve too.
+        ValueError: if they also give an offset or a curve.
     """
     if directory.text(DESCRIPTION).startswith(b"ImageJ="):
         given, source = dict(_CALIBRATION.findall(directory.text(DESCRIPTION))), "calibration of ImageJ"

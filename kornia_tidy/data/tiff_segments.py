@@ -280,7 +280,7 @@ def _jpeg_rows(coded: bytes, high: int, layout: Layout, title: str) -> int:
 
 @cache
 def _tifffile() -> Any:
-    """Import tifffile on first use. What it logs goes to handlers that a program has set, and else nowhere."""
+    """Import tifffile on first use. Its log goes only to handlers that a program has set."""
     logging.getLogger("tifffile").addHandler(logging.NullHandler())
     return import_installed("tifffile")
 

@@ -16,7 +16,7 @@ ASSOCIATIONS = ("associations.txt", "associate.txt")
 
 
 class TUMSequence(SceneDataset):
-    """Data set of a sequence in the format of TUM RGB-D, which ICL-NUIM has, too.
+    """Data set of a sequence in the format of TUM RGB-D, which ICL-NUIM also uses.
 
     Args:
         root: folder with ``rgb.txt`` and ``depth.txt``, which list times and files, or with ``associations.txt``, which
@@ -51,7 +51,7 @@ class TUMSequence(SceneDataset):
         return len(self.pairs)
 
     def name(self, index: int) -> str:
-        """Return the time of an image, as it is listed."""
+        """Return the listed time of an image."""
         return self.pairs[index][0]
 
     def read(self, index: int) -> Scene:
@@ -83,7 +83,7 @@ def _listed(path: Path) -> list[tuple[str, str, str]]:
 
 
 def _associated(root: Path, max_difference: float) -> list[tuple[str, str, str]]:
-    """Return the pairs of images and depths whose times are nearest."""
+    """Return the pairs of images and depths with the nearest times."""
     images, depths = (
         sorted((_seconds(root / name, line[0]), line[0], line[1]) for line in _lines(root / name, 2))
         for name in ("rgb.txt", "depth.txt")

@@ -29,7 +29,7 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
         depth: (1, H, W) in metres, may be infinite; depths beyond the camera's range have the colours of its ends.
         camera: its depth range is that of the colour bar.
         deviation: (1, H, W), standard deviation of the normalised inverse depth. Colours fade to grey as its square
-            reaches that of a depth of which nothing is known, 1/12. None: no pixel is grey.
+            reaches that of an unknown depth, 1/12. None: no pixel is grey.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes its longer side 1800 pixels, the bar not counted.

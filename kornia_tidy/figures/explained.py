@@ -58,7 +58,7 @@ def explain(
 
     Convention:
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light.
-        - PSFs are in the orientation of the image; masks too.
+        - PSFs are in the orientation of the image; so are masks.
     """
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -77,7 +77,7 @@ def explain(
 
 
 def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
-    """Return the PSF bank of each of the first masks shown alone, in the window of the time-averaged PSFs.
+    """Return the PSF bank of each of the first masks without the others, in the window of the time-averaged PSFs.
 
     Example:
         >>> from kornia_tidy import Fidelity, PixelwiseMask

@@ -43,7 +43,7 @@ def draw_lens(optics: TiDyOptics, field: int = 5) -> Figure:
 
     Raises:
         ImportError: if matplotlib is missing.
-        ValueError: if the camera has no lens, or there is no height.
+        ValueError: if the camera has no lens, or the heights are missing.
 
     Convention:
         - The field points lie to the right of the axis. PSFs and rays of a colour are centred on its chief ray.

@@ -51,7 +51,7 @@ def plateau_step(steps: Sequence[int], scores: Sequence[float], tolerance: float
 def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
     """Draw the learning curve of a run from its ``training.csv`` and ``validation.csv``.
 
-    The score is the PSNR of the image, or for depth alone the RMSE in decibels, ``-20 log10(RMSE)``.
+    The score is the PSNR of the image, or for depth only the RMSE in decibels, ``-20 log10(RMSE)``.
 
     Args:
         folder: of the run, as ``kornia-tidy train`` writes it.

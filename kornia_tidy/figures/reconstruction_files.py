@@ -138,7 +138,7 @@ def reconstruct_files(
         overlap: pixels of a tile that are discarded at each cut.
 
     Returns:
-        For each file ``"done"``, ``"kept"``, or the sentence of its error, which is printed too.
+        For each file ``"done"``, ``"kept"``, or the sentence of its error, which is also printed.
 
     Raises:
         ValueError: if two files would get the same results, or one would be replaced.

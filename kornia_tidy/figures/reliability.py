@@ -41,7 +41,7 @@ def draw_reliability(estimates: Mapping[str, Reliability]) -> Figure:
 
     Raises:
         ImportError: if matplotlib is missing.
-        ValueError: if there is no estimate, or there are more than four.
+        ValueError: if there are no estimates or more than four.
     """
     if not 0 < len(estimates) <= len(COLORS):
         raise ValueError(f"the picture shows 1 to {len(COLORS)} estimates, got {len(estimates)}")

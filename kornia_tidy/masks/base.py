@@ -120,11 +120,11 @@ class PhaseMasks(nn.Module):
 
     @property
     def iris(self) -> Tensor | None:
-        """Aperture where the camera is given none; None for the pixels whose centres lie in the disc."""
+        """Default aperture of the camera; None: the pixels with centres in the disc."""
         return None
 
     def is_flat(self) -> bool:
-        """Return whether each mask has one height everywhere, so that the camera is a lens alone.
+        """Return whether each mask has one height everywhere, so that the camera is only a lens.
 
         Example:
             >>> from kornia_tidy import PixelwiseMask

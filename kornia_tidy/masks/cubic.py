@@ -29,7 +29,7 @@ class CubicMask(PhaseMasks):
         - ``phase``: (K, N, N).
 
     Raises:
-        ValueError: if there is no strength, or one is not finite.
+        ValueError: if the strengths are missing or not finite.
 
     Source: Dowski and Cathey, Applied Optics 34(11) 1859 (1995).
 

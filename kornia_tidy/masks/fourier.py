@@ -19,7 +19,7 @@ class FourierMask(PhaseMasks):
 
     The 2F + 1 waves along an axis are :math:`1, \sqrt2 \cos(2\pi f x / W), \sqrt2 \sin(2\pi f x / W)` for f = 1 to F
     over the mask's width W, so a coefficient is the root mean square of its wave over the mask. Together they span
-    every surface whose frequencies along both axes are at most F cycles across the mask.
+    every surface with frequencies of at most F cycles across the mask along both axes.
 
     Args:
         num_masks: number K of masks shown one after the other during the exposure.

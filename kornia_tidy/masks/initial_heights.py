@@ -79,7 +79,7 @@ def initial_heights(start: str, generator: torch.Generator | None = None, size: 
               deviation 6e-8 m. Rotated masks would blur the average PSF.
             - ``"focal sweep"``: for extended depth of field, lenses in focus at a defocus of 0, -8, 8, -16 and 16 rad,
               with normal noise of standard deviation 6e-8 m.
-            - ``"flat"``: zero everywhere, the lens alone.
+            - ``"flat"``: zero everywhere, only the lens.
         generator: source of the noise.
         size: pixels N along a side.
 

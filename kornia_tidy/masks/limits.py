@@ -6,7 +6,7 @@ Phases are radians at 530 nm. With the largest phase m and a free phase :math:`\
 - sigmoid: :math:`m / (1 + e^{-4\varphi/m})`. Its gradient is 1 in the middle of the range, so a learning rate keeps
   its unit.
 - wrapped: :math:`\varphi \bmod m`. Its gradient is 1 everywhere; the jumps are ignored. If m is a whole number of
-  waves, as it is by default, the jumps have no effect at 530 nm.
+  waves, which is the default, the jumps have no effect at 530 nm.
 """
 
 from __future__ import annotations

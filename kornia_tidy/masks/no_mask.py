@@ -1,4 +1,4 @@
-"""No mask: a lens alone, whose pupil is a smooth disc and not the open pixels of a modulator."""
+"""No mask: only a lens, with a smooth disc as its pupil and not the open pixels of a modulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class NoMask(PhaseMasks):
     """No mask: one flat state, and a smooth circular pupil where the camera is given no aperture.
 
     A flat :class:`~kornia_tidy.masks.pixelwise.PixelwiseMask` is a modulator that shows nothing. Its pupil consists of
-    the pixels whose centres lie in the disc, 317 of 23x23: against the disc its PSFs are off by 0.05 in focus and 0.13
+    the pixels with centres in the disc, 317 of 23x23: against the disc its PSFs are off by 0.05 in focus and 0.13
     at psi = 20 (L1, at 530 nm in 41 px of the default camera). Those of 92x92 open areas are off by 0.003 and 0.007.
 
     Args:

@@ -22,7 +22,7 @@ from kornia_tidy.optics.materials import Material
 
 
 class RadialMask(PhaseMasks):
-    r"""Masks whose phase depends on the radius alone, linear between evenly spaced radii.
+    r"""Masks with a phase that depends only on the radius, linear between evenly spaced radii.
 
     Args:
         num_masks: number K of masks shown one after the other during the exposure.

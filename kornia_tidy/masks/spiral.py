@@ -22,7 +22,7 @@ from kornia_tidy.optics.materials import Material
 
 
 class SpiralMask(PhaseMasks):
-    r"""Masks of L rings of equal area, each a vortex phase of its own charge (orbital angular momentum).
+    r"""Masks of L rings of equal area, each a vortex phase with its own charge (orbital angular momentum).
 
     .. math:: \varphi(\rho, \theta) = \ell_z\, \theta + \beta_z \qquad \sqrt{(z-1)/L} \le \rho < \sqrt{z/L}
 

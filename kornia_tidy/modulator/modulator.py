@@ -213,7 +213,7 @@ class DiffractionEfficiency(Modulator):
     Raises:
         ValueError: if the efficiency is out of range.
 
-    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), who take 0.7.
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), with 0.7.
 
     Example:
         >>> import torch

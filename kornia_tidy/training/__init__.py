@@ -1,7 +1,7 @@
 """Joint training of optics and network: settings of a run, data, checkpoints and the Lightning module.
 
 The settings of a run come in, checkpoints of a trained system go out. Read ``run.py`` first, and ``noisy_crops.py`` for
-the training of the network alone. Lightning is an extra
+training only the network. Lightning is an extra
 (``pip install 'kornia-tidy[train]'``), imported by ``module``, ``data_module``, ``callbacks``, ``checkpoint`` and
 ``run`` only.
 """

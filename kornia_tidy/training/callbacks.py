@@ -183,7 +183,7 @@ def drop_rows_after(path: Path, step: int) -> None:
     """Drop lines of later steps, and incomplete lines, from a CSV file."""
     if not path.exists() or not path.stat().st_size:
         return
-    # Of numbers alone, without quotes; csv.reader stops at a block of zeros, as a power cut may leave.
+    # Only of numbers, without quotes; csv.reader stops at a block of zeros, as a power cut may leave.
     heading, *rows = [line.split(",") for line in read_text(path, "replace").splitlines()] or [[]]
     place = heading.index("step") if "step" in heading else 0
     kept = [row for row in rows if len(row) == len(heading) and row[place].isdigit() and int(row[place]) <= step]

@@ -46,7 +46,7 @@ def make_scenes(settings: TrainingSettings, split: str, count: int | None = None
         are cropped to the size: for training at a place drawn from torch's global generator, else in the middle.
 
     Raises:
-        FileNotFoundError: if the data are missing; the message says what to download and where it goes.
+        FileNotFoundError: if the data are missing; the message names the download and its folder.
         ValueError: if a name is unknown, the first scene is smaller than the size, or the data cannot be used.
 
     Example:

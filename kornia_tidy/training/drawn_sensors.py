@@ -1,4 +1,4 @@
-"""A sensor of its own for each capture of a batch, so that masks learn for a range of noise."""
+"""A separate sensor for each capture of a batch, so that masks learn for a range of noise."""
 
 from __future__ import annotations
 

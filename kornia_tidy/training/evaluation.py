@@ -116,7 +116,7 @@ def depth_row(camera: ThinLensCamera | DefocusRange, result: SceneResult) -> dic
           ``depth_rmse_surest``, the RMSE over the 70 % of the pixels that it is surest of.
 
     Convention:
-        Scores in metres count the pixels whose depth is known and lies within :func:`metric_range`, which excludes
+        Scores in metres count the pixels with a known depth within :func:`metric_range`, which excludes
         infinity. Estimates are clamped to this range.
     """
     estimate, truth, mask = result.estimate["depth"][None], result.truth["depth"][None], result.mask[None]

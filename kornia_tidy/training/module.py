@@ -43,7 +43,7 @@ from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import FIXED_OPTICS, LEARN, SCHEDULES, TrainingSettings, differences
 from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
 
-STEPPED = "weights_stepped"  # entry of a checkpoint: the number of weights of which the optimiser has a state
+STEPPED = "weights_stepped"  # entry of a checkpoint: the number of weights with a state in the optimiser
 HELD_OUT_STEP = 4  # the temperature is fitted to every fourth pixel of every fourth row
 
 
@@ -88,7 +88,7 @@ class TidyTraining(pl.LightningModule):
     global generator). Batches of :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`, which hold captures, are for
     fixed optics.
 
-    A network whose ``forward`` has an argument ``noise`` is given the standard deviation of the captures' noise in each
+    A network with an argument ``noise`` of ``forward`` receives the standard deviation of the captures' noise in each
     pixel, (B, 3, H, W), in linear light with full scale 1.
 
     Args:
@@ -107,19 +107,19 @@ class TidyTraining(pl.LightningModule):
         depth_weight: of the depth loss in the joint task.
         image_weight: of the image loss in the joint task.
         learn: ``"both"``, or ``"network"``: the optics are fixed, and the network is trained by AdamW with its usual
-            betas, 0.9 and 0.999; or ``"refiner"``: so is that of depth, and only the second one, for the image, is
-            trained; or ``"masks"``: they alone are trained, through a network that stays as it is, so that it has
-            neither training mode nor average.
+            betas, 0.9 and 0.999; or ``"refiner"``: the optics and the network of depth are fixed, and only the second
+            network, for the image, is trained; or ``"masks"``: only they are trained, through a fixed network without
+            training mode or average.
         sensors: draws the sensor of each scene by torch's global generator, for a network that knows the level of the
             noise. None: the camera's own.
         channels_last: keep the channels of a pixel together in the network's memory.
-        settings: those that camera and network were made from; checkpoints hold them to rebuild both.
+        settings: the settings of camera and network; checkpoints hold them to rebuild both.
 
     Raises:
         ValueError: if a value is not allowed.
 
     Convention:
-        - ``Trainer(precision="bf16-mixed")`` applies to the network alone: optics and losses stay in float32.
+        - ``Trainer(precision="bf16-mixed")`` applies only to the network: optics and losses stay in float32.
         - Batch normalisation uses the statistics of each process's own batches.
 
     Source: Shah et al., TiDy-PSFs (ICCV 2023), section 4.4: Adam with betas 0.99 and 0.999, 1e-8 m for the masks and
@@ -182,8 +182,8 @@ class TidyTraining(pl.LightningModule):
 
         Args:
             settings: of the system and the run.
-            psfs: measured ones, for settings that say so.
-            design: design the masks first if the settings say so; not needed if masks are loaded afterwards.
+            psfs: measured PSFs, for settings with ``measured``.
+            design: design the masks first if the settings ask for it; not needed if masks are loaded afterwards.
             progress: show a progress bar of the design.
         """
         optics = build_optics(settings, psfs)

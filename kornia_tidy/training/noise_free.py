@@ -45,7 +45,7 @@ class NoiseFreeCaptures(Dataset):
     """Data set of noise-free captures: each scene is rendered when it is first read, and read from a file afterwards.
 
     A file holds 16 bits a value: 1 MiB for a scene of 256 x 256 pixels. Worker processes and later runs with the same
-    camera and scenes may share the folder. An item depends on its index alone.
+    camera and scenes may share the folder. An item depends only on its index.
 
     Args:
         scenes: map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere.
@@ -58,7 +58,7 @@ class NoiseFreeCaptures(Dataset):
 
     Convention:
         - The capture is clipped to full scale. Gather and scatter of an image in [0, 1] exceed it by round-off only.
-        - Captures are never flipped: a flipped capture is one by another camera, whose PSFs are flipped.
+        - Captures are never flipped: a flipped capture is one by another camera, with flipped PSFs.
 
     Example:
         >>> import tempfile

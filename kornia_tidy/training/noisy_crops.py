@@ -20,7 +20,7 @@ TINT = 0.1  # standard deviation of the logarithm of each channel's factor, as o
 SHOT_SHARE = 0.5  # share of captures with shot noise; the others have read noise alone
 FULL_WELL = (500.0, 60e3)  # electrons, uniform in its logarithm: at a level of 0.3, a noise of 0.024 to 0.0022
 READ_ELECTRONS = 2.4  # read noise of captures with shot noise, as of an industrial sensor
-TOLD_ERROR = 2.5  # largest factor by which the noise told to the network is wrong in training
+TOLD_ERROR = 2.5  # largest factor between the stated and the true noise in training
 
 
 class NoisyCrops(Dataset):
@@ -33,7 +33,7 @@ class NoisyCrops(Dataset):
 
     No value exceeds full scale, as g is limited to the reciprocal of the crop's brightest value in each channel.
 
-    Half of the captures have read noise alone, with a standard deviation uniform in its logarithm. The others have shot
+    Half of the captures have only read noise, with a standard deviation uniform in its logarithm. The others have shot
     noise, of a full well uniform in its logarithm, and a read noise of 2.4 electrons.
 
     All draws are from torch's global generator, which
@@ -45,9 +45,9 @@ class NoisyCrops(Dataset):
         crop: side of the crop in pixels. None: the whole capture.
         noise_range: least and largest standard deviation of the read noise, in linear light, full scale 1.
         electrons: least and largest full well of the captures with shot noise, see :func:`electrons_of`.
-        gain: draw gains, and errors of the noise that is told. False: the gain is one and the noise the true one, as
+        gain: draw gains, and errors of the stated noise. False: the gain is one and the noise the true one, as
             for validation.
-        noise_error: largest factor by which the noise that is told is wrong, at least 1.
+        noise_error: largest factor between the stated and the true noise, at least 1.
 
     Raises:
         ValueError: if a range is not 0 < least <= largest, the factor is below 1, or a capture is smaller than the
@@ -57,9 +57,9 @@ class NoisyCrops(Dataset):
         Items are mappings of
 
         - ``"coded"``: the capture (3, H, W), and ``"image"``: the all-in-focus image, both encoded as the camera does;
-        - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True where depth is known;
-        - ``"noise"``: (3, H, W), standard deviation of the noise in linear light, full scale 1, by the sensor's model
-          and the noisy capture, as for a capture whose scene is unknown; in training wrong by a factor, see
+        - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True at known depths; - ``"noise"``: (3, H,
+        W), standard deviation of the noise in linear light, full scale 1, by the sensor's model and the noisy capture,
+        as for a capture of an unknown scene; in training wrong by a factor, see
           :func:`random_error`.
 
     Source: Foi et al., Practical Poissonian-Gaussian noise modeling (TIP 2008), for the noise; training over a range of
@@ -183,7 +183,7 @@ def random_gain(peak: Tensor) -> Tensor:
 def random_error(largest: float = TOLD_ERROR) -> float:
     """Return a factor between one over the largest and the largest, uniform in its logarithm, by the global generator.
 
-    A network that is told a wrong noise learns to look at the capture, too: a user seldom knows the noise of a
+    From wrong noise levels a network learns to check the capture: a user seldom knows the noise of a
     photograph to better than a factor.
 
     Example:

@@ -24,7 +24,7 @@ def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
         ``"scores"`` by test set, if the run was evaluated, and ``"validation"``, the lines of ``validation.csv``.
 
     Raises:
-        FileNotFoundError: if there is no such folder, or neither file in it.
+        FileNotFoundError: if the folder or both files are missing.
         ValueError: if a file is damaged.
 
     Example:

@@ -157,7 +157,7 @@ def _train(
     )
     assert module.settings is not None
     if settings.data in PAINTED:
-        module.optics.notes.told.add("depth")  # painted in metres: a far scene is no sign of another unit
+        module.optics.notes.told.add("depth")  # painted in metres: a far scene does not suggest another unit
     if masks_from is not None and checkpoint is None:
         load_masks(masks_from, module.optics)
         module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
@@ -237,7 +237,7 @@ def _check_run(
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
-    """Load the initial weights of a network; those of one for the image alone, of fewer blocks or maps, are widened.
+    """Load the initial weights of a network, widened from a network for the image, or with fewer blocks or maps.
 
     PSFs and noise of its closed form stay those of this camera, and so does a refiner where the other has none.
     """

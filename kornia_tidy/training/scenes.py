@@ -95,7 +95,7 @@ class Broken(NamedTuple):
 
 
 class RepeatableScenes(Dataset):
-    """Data set whose items depend on epoch and index alone, not on the worker or the order of loading.
+    """Data set with items that depend only on epoch and index, not on the worker or the order of loading.
 
     Args:
         scenes: a map-style data set of ``{"image", "depth"}``, with ``"mask"`` where depth is not known everywhere; or
@@ -169,7 +169,7 @@ class _Collate:
 
 
 class SceneLoader(DataLoader):
-    """Data loader whose batches depend on seed and epoch alone, and that resumes in the middle of an epoch.
+    """Data loader with batches that depend only on seed and epoch; it resumes in the middle of an epoch.
 
     It does not use the global generators. Lightning saves and restores its state.
 

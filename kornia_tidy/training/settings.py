@@ -65,7 +65,7 @@ class SceneSettings:
         size: side of the scenes; larger ones are cropped, at random for training.
         scenes: number for training, of patches and of scenes made here.
         validation_scenes: largest number for validation.
-        crop: side of what a step sees of a capture, for fixed optics. None: all of it.
+        crop: side of the crop of a capture in a step, for fixed optics. None: all of it.
         augment: flip scenes and vary their brightness by 0.8 to 1.1, as PhaseCam3D does; not for fixed optics.
     """
 
@@ -85,8 +85,8 @@ class LightSettings:
     Args:
         noise_range: least and largest standard deviation of the read noise, of full scale, drawn for half of the
             captures; the sensor's own noise is that of scores afterwards.
-        noise_error: largest factor by which the noise told to the network is wrong, for fixed optics: how well the
-            noise of later captures will be known; 1: exactly.
+        noise_error: largest factor between the noise given to the network and the true one, for fixed optics: the
+            expected error for later captures; 1: none.
         electrons: least and largest number of electrons of white at the reference f-number, drawn for the other half,
             which has shot noise: a smaller aperture gets fewer in the same exposure time. None: 500 to 60000 at any
             f-number.
@@ -112,7 +112,7 @@ class LearningSettings:
     """Learning.
 
     Args:
-        learn: what is learnt. Behind fixed optics each scene is rendered once, see
+        learn: the parts to learn. Behind fixed optics each scene is rendered once, see
             :class:`~kornia_tidy.training.noise_free.NoiseFreeCaptures`, and crop, gain and noise are drawn for each
             step, see :class:`~kornia_tidy.training.noisy_crops.NoisyCrops`; masks are learnt with noise drawn for each
             scene.
@@ -186,7 +186,7 @@ class TrainingSettings(LearningSettings, LightSettings, SceneSettings, SystemSet
 
     @property
     def fixed_optics(self) -> bool:
-        """Whether the masks stay as they are, so that each scene is rendered once."""
+        """Whether the masks are fixed, so that each scene is rendered once."""
         return self.learn in FIXED_OPTICS
 
     @classmethod
@@ -207,7 +207,7 @@ def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:
 
     Where only the network learns they are those of :data:`NETWORK_RUN`, without the closed form where the head cannot
     have it or does without: networks of three channels, heads without a network, and ``residual``. The closed form is
-    Wiener's; runs for image and depth with it have the defaults of :data:`JOINT_RUN` too.
+    Wiener's; runs for image and depth with it also have the defaults of :data:`JOINT_RUN`.
 
     Args:
         given: settings that the user chose, by name.

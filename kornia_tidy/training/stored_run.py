@@ -21,7 +21,7 @@ from kornia_tidy.training.module import STEPPED, TidyTraining
 from kornia_tidy.training.random_state import check_random_states
 
 MOST = 1 << 53  # of steps, batches and epochs
-OLDEST = Version("2.6")  # Lightning, whose loops have these names
+OLDEST = Version("2.6")  # Lightning; its loops have these names
 LAST_BATCH = "is_last_batch"  # the one flag that changes during a run
 COUNTED = ("ready", "started", "processed", "completed")  # one after the other
 _MISSING = object()
@@ -127,7 +127,7 @@ def _check_loops(state: Mapping[str, Any], trainer: pl.Trainer, batches: int) ->
 
 
 def _check_counts(stored: Any, place: str) -> None:
-    """Raise ``ValueError`` unless what is completed was processed, started and ready before."""
+    """Raise ``ValueError`` unless completed items were processed, started and ready before."""
     if not isinstance(stored, Mapping):
         return
     if "ready" in stored:

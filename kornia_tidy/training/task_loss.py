@@ -48,7 +48,7 @@ def charbonnier_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = N
 
 
 def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return the negative PSNR plus structural dissimilarity, by which restored images are judged.
+    r"""Return the negative PSNR plus structural dissimilarity, the score of restored images.
 
     .. math:: L = 10 \log_{10}(\mathrm{MSE} + 10^{-5}) + 20 \, (1 - \mathrm{SSIM})
 
@@ -67,8 +67,8 @@ def psnr_ssim_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = Non
     Raises:
         ValueError: if maps are smaller than 11 pixels.
 
-    Source: Chen et al., Simple Baselines for Image Restoration (ECCV 2022), whose loss is the PSNR; Zhao et al., Loss
-    Functions for Image Restoration With Neural Networks (IEEE TCI 2017), for the SSIM beside it.
+    Source: Chen et al., Simple Baselines for Image Restoration (ECCV 2022), for the PSNR as a loss; Zhao et al., Loss
+    Functions for Image Restoration With Neural Networks (IEEE TCI 2017), for the added SSIM.
 
     Example:
         >>> import torch

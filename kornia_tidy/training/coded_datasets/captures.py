@@ -61,7 +61,7 @@ class CodedCaptures(Dataset[dict[str, Any]]):
         """Return one capture; a negative index counts from the end.
 
         Raises:
-            IndexError: if there is no such item.
+            IndexError: if the index is out of range.
             UnreadableItemError: if one of its files is damaged or missing.
         """
         index = item_index(index, len(self))

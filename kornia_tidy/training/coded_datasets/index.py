@@ -1,4 +1,4 @@
-"""Index of a coded data set: one line per item with the place of each of its maps."""
+"""Index of a coded data set: one line per item with the place of each map."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_index(folder: Path) -> list[Entry]:
     """Return the lines of a folder's index.
 
     Raises:
-        FileNotFoundError: if there is none; it is written after the last capture.
+        FileNotFoundError: if the file is missing; it is written after the last capture.
         ValueError: if it is damaged.
     """
     path = folder / INDEX
@@ -62,8 +62,8 @@ def read_place(folder: Path, place: str) -> bytes:
     """Return the bytes at a place.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the place lies outside the folder or is none, or the file ends too early.
+        FileNotFoundError: if the file is missing.
+        ValueError: if the place is missing or outside the folder, or the file ends too early.
     """
     match = _PLACE.fullmatch(place)
     if match is None or PurePosixPath(match[1]).is_absolute() or ".." in PurePosixPath(match[1]).parts:

@@ -1,6 +1,6 @@
 """Photographing of a data set of scenes to captures on disk, resumable and by any number of processes.
 
-A capture depends on camera, scene, seed and number alone. On the CPU its last digit depends on the number of threads:
+A capture depends only on camera, scene, seed and number. On the CPU its last digit depends on the number of threads:
 see :mod:`kornia_tidy.render.repeatable`. Several processes share the work.
 """
 
@@ -99,9 +99,9 @@ def render_scenes(
         jobs: number of worker processes of this call.
         rank: number of this call among those that share the work, here or on other machines that see the folder.
         world: number of those calls. They need not run at the same time.
-        take_over: render what others have not written yet when this call's own share is complete. The work of a process
-            that was lost is then done by the others. Near the end several processes may render the same part, where
-            they would otherwise wait: the first one that is complete stays.
+        take_over: once this call's share is complete, render captures that others have not written yet. The work of a
+            process that was lost is then done by the others. Near the end several processes may render the same part,
+            where they would otherwise wait: the first one that is complete stays.
         made_from: how camera and scenes were made, as plain values, for ``render.json``.
         each: called after each item with the number of finished items and of all items of this call.
 
@@ -254,7 +254,7 @@ def _photograph(
     jobs: int,
     counted: Callable[[Iterator[Capture]], Iterator[Capture]] | None = None,
 ) -> None:
-    """Render folders or shards and write each as soon as it is complete."""
+    """Render folders or shards and write each on completion."""
     captures = _rendered(items, [index for part in parts for index in part.items], jobs) if parts else iter(())
     captures = captures if counted is None else counted(captures)
     for part in parts:

@@ -26,10 +26,10 @@ def decode_sample(sample: Mapping[str, Any]) -> dict[str, Any]:
     Returns:
         ``{"coded", "image", "depth", "mask", "index", "name"}``, without the maps that were not stored. Images
         (3, H, W) float32, depth (1, H, W) float32 in metres, mask (1, H, W) bool. Other files of the sample are passed
-        on as they are; entries that begin with ``__`` are left out, and WebDataset adds ``"__key__"`` again.
+        on unchanged; entries that begin with ``__`` are left out, and WebDataset adds ``"__key__"`` again.
 
     Raises:
-        UnreadableItemError: if a file is damaged, or the sample is no capture. ``map(decode_sample,
+        UnreadableItemError: if a file is damaged, or the sample is not a capture. ``map(decode_sample,
             handler=webdataset.warn_and_continue)`` skips it.
 
     Example:
