@@ -63,7 +63,7 @@ def home(name: str) -> str:
 
 
 def package_page(package: str, wanted: dict[str, set[str]]) -> str:
-    """Return the page of a package: what it exports, its packages, then what pages import from its modules."""
+    """Return the page of a package: its exports, its packages, then the names that pages import from its modules."""
     title = package.removeprefix("kornia_tidy.")
     lines = [title, "=" * len(title), "", *automodule(package)]
     module = importlib.import_module(package)
@@ -83,7 +83,7 @@ def package_page(package: str, wanted: dict[str, set[str]]) -> str:
 
 
 def automodule(name: str) -> list[str]:
-    """Return the directive that describes a module, and what it exports where it lists that."""
+    """Return the directive that describes a module, and its exports where it lists them."""
     source = importlib.util.find_spec(name)
     text = Path(source.origin).read_text(encoding="utf-8") if source and source.origin else ""
     exports = name.rpartition(".")[2] not in ADAPTERS and re.search(r"^__all__\b", text, re.MULTILINE) is not None

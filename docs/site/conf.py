@@ -29,7 +29,7 @@ extensions = [
 ]
 nitpicky = True
 _SETTINGS = "Metres|Distance|DepthRange|Seed|Preset|Compositing|Border|StrayLight|ColorSpace|Start|Inverse"
-# Other names of float, int and str, by which settings tell their units, ranges and choices.
+# Other names of float, int and str, with the units, ranges and choices of settings.
 nitpick_ignore_regex = [("py:class", _SETTINGS), ("py:obj", r"typing\.Annotated.*")]
 default_role = "literal"  # docstrings write commands as Markdown does
 exclude_patterns = ["examples/*.md"]
@@ -56,7 +56,7 @@ html_css_files = ["site.css"]
 html_show_sphinx = False
 html_theme_options = {
     "navigation_with_keys": True,
-    "top_of_page_buttons": [],  # pages of the gallery and the reference are made: there is no source to view or edit
+    "top_of_page_buttons": [],  # pages of the gallery and the reference are made: there is not a source to view or edit
 }
 copybutton_prompt_text = r">>> |\.\.\. "
 copybutton_prompt_is_regexp = True

@@ -29,7 +29,7 @@ def visit_inline(writer: Any, node: nodes.math) -> None:
 
 
 def visit_block(writer: Any, node: nodes.math_block) -> None:
-    """Write a formula of its own."""
+    """Write a displayed formula."""
     writer.body.append(f'<div class="formula">{formula(node.astext(), "block")}</div>\n')
     raise nodes.SkipNode
 

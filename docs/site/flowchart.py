@@ -25,7 +25,7 @@ Name = str | tuple[str, str, int]  # of a box, or of the place of an arrow in a 
 
 
 class Chart(NamedTuple):
-    """What a flow chart says."""
+    """Contents of a flow chart."""
 
     across: bool  # from left to right
     lines: dict[str, list[str]]  # of text in each box
@@ -52,7 +52,7 @@ def read_chart(text: str) -> Chart:
 
 
 def ranks(chart: Chart) -> dict[str, int]:
-    """Return the layer of each box: below all that point to it, and near to what it points to."""
+    """Return the layer of each box: below all boxes that point to it, and near its targets."""
     found = dict.fromkeys(chart.lines, 0)
     for _ in found:  # the longest path has fewer arrows than there are boxes
         for start, end in chart.arrows:
@@ -88,7 +88,7 @@ def layout(chart: Chart) -> tuple[list[list[Name]], dict[tuple[str, str], list[N
 
 
 def neighbours(stations: dict[tuple[str, str], list[Name]]) -> dict[Name, tuple[list[Name], list[Name]]]:
-    """Return what lies before and after each box and place on its arrows."""
+    """Return the predecessors and successors of each box and place on its arrows."""
     near: dict[Name, tuple[list[Name], list[Name]]] = defaultdict(lambda: ([], []))
     for path in stations.values():
         for one, other in itertools.pairwise(path):

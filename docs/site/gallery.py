@@ -1,6 +1,6 @@
-"""The gallery: each script of examples/ with what it prints and draws, made when the site is built.
+"""The gallery: each script of examples/ with its output and pictures, made when the site is built.
 
-Results are kept in outputs/gallery, and made again when the script or what is below changes.
+Results are kept in outputs/gallery, and made again when the script or the values below change.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ARGUMENTS = {
     "train_on_rendered": "--scenes 16 --size 96 --epochs 4 --output captures",
 }
 NEEDS = {"ray_rendering": "ray"}  # packages without which only the script is shown
-CARD_LINES = 14  # of what an example prints, in its card
+CARD_LINES = 14  # of an example's output, in its card
 DRAW = Path(__file__).with_name("run_example.py")
 COMMAND = re.compile(r"^ *python examples/.*\n", re.MULTILINE)
 
@@ -74,7 +74,7 @@ Each script of `examples/` answers one question. Pictures and numbers are made w
 
 
 def write_gallery(pages: Path, results: Path, examples: list[Path], *, run: bool) -> None:
-    """Write the index and the page of each example; run those whose results are missing or stale."""
+    """Write the index and the page of each example; run those with missing or stale results."""
     (pages / "images").mkdir(parents=True, exist_ok=True)
     examples.sort(key=lambda path: [*TITLES, path.stem].index(path.stem))
     for example in examples:
@@ -86,7 +86,7 @@ def write_gallery(pages: Path, results: Path, examples: list[Path], *, run: bool
 
 
 def run_example(example: Path, folder: Path) -> None:
-    """Run a script in a folder of its own, unless its results there are up to date; an error ends the build."""
+    """Run a script in a separate folder, unless its results there are up to date; an error ends the build."""
     made_of = hashlib.sha256(ARGUMENTS.get(example.stem, "").encode() + DRAW.read_bytes())
     for script in [example, *(path for path in example.parent.glob("*.py") if f"from {path.stem} " in text(example))]:
         made_of.update(script.read_bytes())
@@ -114,7 +114,7 @@ def run_example(example: Path, folder: Path) -> None:
 
 
 def write_page(example: Path, folder: Path, pages: Path) -> None:
-    """Write the page of an example from its docstring and from what a run has left."""
+    """Write the page of an example from its docstring and from the files of a run."""
     shutil.copyfile(example, pages / example.name)
     described = ast.get_docstring(ast.parse(text(example))) or ""
     words = COMMAND.sub("", described + "\n").strip()
@@ -140,7 +140,7 @@ def write_page(example: Path, folder: Path, pages: Path) -> None:
 
 
 def card(example: Path, pages: Path, results: Path) -> str:
-    """Return the card of an example in the index: its first picture, or what it prints."""
+    """Return the card of an example in the index: its first picture, or its output."""
     described = ast.get_docstring(ast.parse(text(example))) or ""
     lead = " ".join(described.partition("\n\n")[0].split())
     pictures = sorted((pages / "images").glob(f"{example.stem}-*.png"))
@@ -154,7 +154,7 @@ def card(example: Path, pages: Path, results: Path) -> str:
 
 
 def text(path: Path) -> str:
-    """Return what a file says."""
+    """Return the text of a file."""
     return path.read_text(encoding="utf-8")
 
 

@@ -29,7 +29,7 @@ LINK = re.compile(r"\]\(([^)#:\s]+)\)")  # target of a link of Markdown inside t
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Copy the pages beside each other, write those that are made, and build the site."""
+    """Copy the pages beside each other, write the generated ones, and build the site."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--no-gallery", action="store_true", help="run no example")
     parser.add_argument("--linkcheck", action="store_true", help="ask for external links, too")
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def copy_pages(source: Path) -> list[Path]:
-    """Copy pages and what they link to in the repository, so that links hold, and drop what is gone from it."""
+    """Copy pages and their link targets in the repository, so that links hold, and drop files that are gone from it."""
     listed = [ROOT / name for name in PAGES] + [
         path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg"}
     ]

@@ -19,7 +19,7 @@ import kornia_tidy
 
 
 def resolve(app: Any, env: Any, node: Any, contnode: Any) -> Any:
-    """Return a link to a public object, plain text for another one that exists, None (a warning) for what does not."""
+    """Return a link to a public object, plain text for another one that exists, None (a warning) for a missing one."""
     if node.get("refdomain") != "py":
         return None
     target = node["reftarget"].lstrip("~.")

@@ -1,4 +1,4 @@
-"""Run one example for the gallery, and draw what its main() returns where it draws nothing itself."""
+"""Run one example for the gallery, and draw the result of its main() unless it draws itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def main(script: str, arguments: list[str]) -> None:
-    """Run a script in the current folder, and draw what it returns if it draws nothing."""
+    """Run a script in the current folder, and draw its result unless it draws itself."""
     sys.path.insert(0, str(Path(script).parent))
     returned = importlib.import_module(Path(script).stem).main(arguments)
     if not any(Path().rglob("*.png")):

@@ -132,7 +132,7 @@ def _open_closed_streams() -> None:
 
 
 def _empty(stream: TextIO) -> None:
-    """Write what a stream holds, or drop it: Python would complain of it at the end and change the exit status."""
+    """Write the buffer of a stream, or drop it: Python would complain of it at the end and change the exit status."""
     try:
         stream.flush()
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Mask design: objectives of a mask computed from its PSFs alone, their minimisation, and co-design with the aperture.
+"""Mask design: objectives of a mask computed from only its PSFs, their minimisation, and co-design with the aperture.
 
 A lens or its PSF bank comes in. The error of the best linear restoration, that of depth by texture, the Cramér-Rao
 bound on a point's depth, or designed masks go out. No image and no network is needed. ``non_convexity.py`` shows which

@@ -35,13 +35,13 @@ class Candidate:
     """A camera that the search found.
 
     Args:
-        start: ``"flat lens"``, or what its masks started from.
+        start: ``"flat lens"``, or the start of its masks.
         f_number: focal length over aperture diameter.
         focus: in focus, as a fraction of the range of inverse depth, 0 at the far end.
         image_error: error of the best linear restoration, NaN if the image has no weight; see :func:`cost_of`.
         depth_error: expected RMSE of inverse depth from texture, as a fraction of the range; NaN if depth has no
             weight.
-        cost: what is minimised, in dB: see :func:`cost_of`.
+        cost: minimised cost in dB: see :func:`cost_of`.
         phase: masks in radians at 530 nm, (K, N, N); None for a flat lens.
     """
 
@@ -79,7 +79,7 @@ def search_lens(task: DesignTask, masks: PixelwiseMask | None, f_number: float, 
 
 
 def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return what a co-design minimises, and its two parts.
+    r"""Return the cost that a co-design minimises, and its two parts.
 
     .. math:: 10 \log_{10} \left( R^{1 - w} E^{2 w} \right)
 
@@ -92,7 +92,7 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
         f_number: of the lens.
 
     Returns:
-        Cost in dB, R and E, each 0-dimensional. What has no weight is NaN.
+        Cost in dB, R and E, each 0-dimensional. Parts without a weight are NaN.
     """
     weight, unknown = task.depth_weight, torch.tensor(math.nan)
     if weight == 0:
@@ -129,7 +129,7 @@ def coded_candidate(
     """Return masks optimised for an f-number and a focus.
 
     Args:
-        task: what is given.
+        task: the given lens, light and depths.
         start: one of ``STARTS``, or masks to go on from, radians (K, N, N).
         f_number: of the lens.
         focus: fraction of the range of inverse depth.

@@ -1,4 +1,4 @@
-"""Closed-form restoration and depth estimation, by which co-design compares cameras without training a network."""
+"""Closed-form restoration and depth estimation, with which co-design compares cameras without training a network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DEPTHS = 11  # at which the likelihood is computed
 CONTRASTS = (1 / 4, 8.0)  # of a texture's variance to that of all scenes
 MISFIT = 10.0  # times the noise: edges of depth and other light that one PSF does not explain
 WINDOWS = (15, 31)  # px; side of the squares over which the likelihood is summed
-TEMPERATURES = (4.0, 16.0, 64.0)  # by which the log-likelihood is divided: neighbouring pixels are not independent
+TEMPERATURES = (4.0, 16.0, 64.0)  # divisor of the log-likelihood: neighbouring pixels are not independent
 
 
 class WienerFilter:
@@ -69,7 +69,7 @@ def plane_size(bank: PSFBank, size: tuple[int, int]) -> tuple[int, int]:
 
 
 def restorations(capture: Tensor, wiener: WienerFilter, by_depth: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Return the restorations of a capture: as it is and by the Wiener filter, each without and with bilateral filter.
+    """Return the restorations of a capture: none and the Wiener filter, each without and with bilateral filter.
 
     Args:
         capture: (1, 3, H, W) linear light.

@@ -1,8 +1,8 @@
 """Co-design of aperture, focus and masks: a search over f-numbers, decided by simulated captures.
 
 The search minimises :func:`~kornia_tidy.design.candidates.cost_of`: first flat lenses and focal sweeps on a coarse
-grid of f-numbers, then masks from several starts on a finer grid around the best. Simulated captures are made of the
-finalists, of which :func:`~kornia_tidy.design.verdict.decide` takes one.
+grid of f-numbers, then masks from several starts on a finer grid around the best. Finalists take simulated captures,
+and :func:`~kornia_tidy.design.verdict.decide` chooses one.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from kornia_tidy.psf.camera_settings import digest_of, settings_of
 STOP = 2**0.5
 FOCUS_STEP = 0.1  # of the range of inverse depth
 FLAT_FINALISTS = (STOP**-1, STOP**-0.5, 1.0, STOP**0.5, STOP)  # times the best f-number of the search
-# The measure rates wide apertures too high, so that slower ones are finalists too.
+# The measure rates wide apertures too high, so slower ones are also finalists.
 CODED_FINALISTS = (STOP**-0.5, 1.0, STOP**0.5, STOP)
 
 
@@ -66,9 +66,9 @@ class CoDesign:
     """Result of a co-design.
 
     Args:
-        task: what was given.
+        task: the given task.
         candidates: all cameras of the search, in its order.
-        finalists: those that took simulated captures.
+        finalists: candidates that took simulated captures.
         verdict: best masks against best flat lens.
         words: the verdict as a sentence.
     """
@@ -171,7 +171,7 @@ def expected_in_words(task: DesignTask, effort: Effort, work: dict[str, int]) ->
     """Return the work of :func:`planned_work` and its time in words, from a few steps and one capture."""
     f_number = task.f_numbers()[1]
     times = []
-    for steps in (1, 3):  # the first step also computes what the others find
+    for steps in (1, 3):  # the first step also computes values that the others need
         start = time.perf_counter()
         coded_candidate(task, "focal sweep", f_number, 0.5, steps)
         times.append(time.perf_counter() - start)
@@ -265,7 +265,7 @@ def _around(candidates: list[Candidate], factors: Sequence[float]) -> list[Candi
 
 
 def _about(task: DesignTask, effort: Effort, seed: int, scenes: Sequence[Scene]) -> dict[str, Any]:
-    """Return what a progress file belongs to, as plain data."""
+    """Return the key of a progress file as plain data."""
     pictures = [digest_of(scene.image, scene.depth) for scene in scenes]
     weights = digest_of(*task.modulator.parameters())  # settings hold none
     about = {"task": settings_of(task), "modulator": weights, "effort": settings_of(effort)}

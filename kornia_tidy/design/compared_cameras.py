@@ -60,9 +60,9 @@ class Result(NamedTuple):
 def shipped_cameras(electrons: float) -> dict[str, Camera]:
     """Return the shipped systems that are shown, for the light of a white pixel at the reference f-number.
 
-    ``"coded"`` has the most masks of those for an image in focus everywhere, ``"joint"`` of those for depth too; of
-    several with as many masks the one that tells how sure its depth is, else that with the largest f-number. ``"flat"``
-    has none. Each as far as one is shipped.
+    ``"coded"`` has the most masks of those for an image in focus everywhere, ``"joint"`` of those that also estimate
+    depth; of several with as many masks the one that estimates the uncertainty of its depth, else that with the largest
+    f-number. ``"flat"`` has none. Each as far as one is shipped.
 
     Example:
         >>> round(shipped_cameras(57_000)["coded"].optics.sensor.full_well) > 10_000

@@ -49,7 +49,7 @@ def depth_confusion(bank: PSFBank, noise: float, statistics: SceneStatistics = P
         E_{image} = \sum_{dd'} \pi_d \, q_{dd'}
             \frac{\langle S_f |1 - G_{d'f} H_{df}|^2 + \sigma^2 |G_{d'f}|^2 \rangle}{\langle S_f \rangle}
 
-    where G is the Wiener filter for all patches of the same estimate, whose true depths are distributed as
+    where G is the Wiener filter for all patches of the same estimate, with true depths distributed as
     :math:`\pi_d \, q_{dd'}`. Half the squared error is the variance of the range if nothing is known, as for an
     estimate by the mean.
 
@@ -65,8 +65,8 @@ def depth_confusion(bank: PSFBank, noise: float, statistics: SceneStatistics = P
         ValueError: if the noise is not positive.
 
     Source: Levin, Fergus, Durand and Freeman, Image and Depth from a Conventional Camera with a Coded Aperture
-    (SIGGRAPH 2007), section 3.1: the Kullback-Leibler divergence between captures at different depths as what an
-    aperture is chosen by.
+    (SIGGRAPH 2007), section 3.1: the Kullback-Leibler divergence between captures at different depths as the criterion
+    of an aperture.
 
     Example:
         >>> x = torch.arange(15) - 7

@@ -24,8 +24,8 @@ class DesignMemory:
     """Designed masks and scores by name, in a file that is written whole after each entry.
 
     Args:
-        path: the file. None keeps the entries in this process alone.
-        about: what the entries belong to: task, effort, seed and scenes. A file about something else is replaced.
+        path: the file. None keeps the entries only in this process.
+        about: key of the entries: task, effort, seed and scenes. A file about something else is replaced.
 
     Example:
         >>> memory = DesignMemory()

@@ -30,7 +30,7 @@ class DesignTask(DesignSettings):
 
     Args:
         modulator: shows the masks, with its switching, levels and losses. Default: equal dwell times without delay.
-            The flat lens, to which masks are compared, has none.
+            The flat lens, the baseline of masks, has none.
         statistics: of the scenes: power spectrum, light, and the distribution of inverse depth over the range.
         settings: the others, as in :class:`~kornia_tidy.design.settings.DesignSettings`.
 

@@ -1,6 +1,6 @@
 r"""Fisher information of a point's defocus and position in its image, and the Cramér-Rao bound on their estimates.
 
-A pixel counts :math:`\mu = N h + b` photons on average, Poisson distributed: N of the point, whose PSF is h, and b of
+A pixel counts :math:`\mu = N h + b` photons on average, Poisson distributed: N of the point with the PSF h, and b of
 the background. No unbiased estimate of the parameters :math:`\theta` has a covariance below the inverse of
 
 .. math:: I_{ij} = \sum_{c,p} \frac{1}{\mu_{cp}} \frac{\partial \mu_{cp}}{\partial \theta_i}

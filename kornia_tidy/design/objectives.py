@@ -109,7 +109,7 @@ def restoration_error(
 
     The error is low if H is large, so that noise is not amplified, and if it depends little on depth, so that one
     filter fits all depths. A small PSF at one depth only does not suffice, nor does a large PSF that is the same at all
-    depths. What the filter leaves far from a point, a halo, counts more than what it leaves near to it: halos of bright
+    depths. A halo, the filter's error far from a point, counts more than its error nearby: halos of bright
     objects show on dark ones.
 
     Args:
@@ -214,8 +214,8 @@ def design_fisher_mask(
     Raises:
         ValueError: if ``limit`` or ``iterations`` is not positive.
 
-    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for a mask designed in this way, whose bound is 0.0785;
-    Shechtman et al., Physical Review Letters 113, 133902 (2014), for the tetrapod PSF that results.
+    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for a mask designed in this way, with a bound of 0.0785;
+    Shechtman et al., Physical Review Letters 113, 133902 (2014), for the resulting tetrapod PSF.
 
     Example:
         >>> mask, bound = design_fisher_mask(iterations=2)

@@ -19,7 +19,7 @@ class DesignSettings:
 
     Args:
         depth_range: nearest and farthest depth that the camera is for; the farthest may be inf.
-        depth_weight: share of depth in what matters, from 0, the image alone, to 1.
+        depth_weight: weight of depth, from 0, only the image, to 1.
         focal_length: of the lens.
         pixel_pitch: of the sensor.
         electrons: of a white pixel at the reference f-number. The exposure time is the same at every f-number, but for
@@ -28,7 +28,7 @@ class DesignSettings:
         full_well: electrons from black to white, which limit the exposure. None: by the pixel's area, 57000 at 8 um.
         read_noise: its standard deviation.
         masks: in one exposure.
-        mask_size: pixels along a side of a mask, 20 of 23 of which span the aperture: more scatter less light.
+        mask_size: pixels along a side of a mask; 20 of 23 span the aperture, and more pixels scatter less light.
     """
 
     depth_range: DepthRange = (0.2975, math.inf)

@@ -60,7 +60,7 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
     """Yield the scores of a candidate on each scene.
 
     Args:
-        task: what is given, and the weight of depth: what has no weight is not scored.
+        task: the task with the weight of depth: parts without a weight are not scored.
         candidate: flat lens or masks.
         scenes: images sRGB (3, H, W) in [0, 1], depth in metres.
         seed: of the noise, which is the same for all candidates as far as their light is.

@@ -21,7 +21,7 @@ class Finalist:
     Args:
         candidate: the camera.
         settings: of the closed forms, for image and depth, the best ones on the first half of the scenes.
-        chosen_by: mean score in dB on the first half, by which finalists are chosen.
+        chosen_by: mean score in dB on the first half, which chooses finalists.
         scores: in dB on each scene of the second half, weighted as the task says.
         image: mean PSNR on the second half in dB; NaN if the image has no weight.
         depth: root mean square of the scenes' depth errors there, as a fraction of the range; NaN if depth has none.

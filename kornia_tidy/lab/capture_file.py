@@ -26,7 +26,7 @@ PICTURES = (
 
 
 class CaptureLight(NamedTuple):
-    """A capture in linear light, and what its file tells of it."""
+    """A capture in linear light, and its description in the file."""
 
     light: Tensor
     """(C, H, W), as the pixels lie on the sensor."""
@@ -55,10 +55,10 @@ def read_light(
         linear: a picture holds linear light, not sRGB.
         white_balance: of a raw file, see :func:`~kornia_tidy.lab.raw.develop.develop`.
         sensor: its noise. None: that of the noise profile of a raw file, if it has one.
-        calibration: measurement of the noise, whose sensor has the units of the raw file before it is developed.
+        calibration: measurement of the noise, with a sensor in the units of the raw file before it is developed.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it cannot be read, or was not taken as the captures of the calibration.
 
     Example:

@@ -109,7 +109,7 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
     Args:
         files: inputs; one that is named twice counts once.
         folder: of the outputs.
-        suffixes: that take the place of a file's own, one for each of its outputs.
+        suffixes: replacements of a file's suffix, one for each output.
 
     Raises:
         ValueError: if two files would become the same picture, or a picture would replace one of the files.

@@ -1,6 +1,6 @@
 """Systems of a camera that was measured: its PSFs and its noise in the settings, and the closed form to restore with.
 
-A laboratory measures the finished camera, whatever was designed. What it measured replaces what would be computed: the
+A laboratory measures the finished camera, whatever was designed. Measurements replace computed values: the
 PSFs of masks and lens, and the noise of the sensor.
 """
 
@@ -99,7 +99,7 @@ def closed_form_system(
 def with_measurements(
     system: TrainedSystem, psfs: MeasuredPSFs | None = None, sensor: SensorNoise | None = None
 ) -> TrainedSystem:
-    """Return a trained system for the camera that was measured: its network is told the PSFs and the noise.
+    """Return a trained system for the camera that was measured: its network uses the measured PSFs and noise.
 
     Args:
         system: camera and network, which are not changed; masks and weights are shared.

@@ -1,8 +1,8 @@
 """Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
 
 A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
-``noise.py`` first; ``sensor.py`` has what it shares with sensors of your own, ``steps.py`` single steps,
-``fixed_pattern.py`` what differs from pixel to pixel, ``exposure.py`` the light that an f-number admits.
+``noise.py`` first; ``sensor.py`` has the base of your own sensors, ``steps.py`` single steps, ``fixed_pattern.py`` the
+differences between pixels, ``exposure.py`` the light that an f-number admits.
 """
 
 from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor, full_well_of

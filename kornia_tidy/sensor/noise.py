@@ -27,7 +27,7 @@ class SensorNoise(Sensor):
     6. the value is clipped to [0, 1].
 
     Steps 1 to 3 need ``full_well``, step 5 needs ``bits``. The noise is drawn in training and in ``eval()`` alike, as
-    a real camera has it at test time too.
+    a real camera also has it at test time.
 
     Args:
         sigma: standard deviation of the read noise, in units of full scale.
@@ -45,7 +45,7 @@ class SensorNoise(Sensor):
 
     Shape:
         - image: (B, C, H, W), linear light, 1.0 = full scale, float16, bfloat16, float32 or float64.
-        - Output: the same shape and dtype, computed in float32 (float64 for float64) under autocast too.
+        - Output: the same shape and dtype, also under autocast computed in float32 (float64 for float64).
 
     Convention:
         - Gradients are those of :func:`shot_noise` and :func:`quantize`, and zero where a value is clipped.
@@ -115,7 +115,7 @@ class SensorNoise(Sensor):
 
     @property
     def noise(self) -> dict[str, Callable[..., Tensor]]:
-        """What is drawn: "read" if ``sigma`` is not zero, "shot", uniform in [0, 1), if ``full_well`` is given."""
+        """The draws: "read" if ``sigma`` is not zero, "shot", uniform in [0, 1), if ``full_well`` is given."""
         samplers: dict[str, Callable[..., Tensor]] = {"read": torch.randn} if self.sigma > 0 else {}
         return samplers if self.full_well is None else samplers | {"shot": torch.rand}
 
@@ -140,7 +140,7 @@ class SensorNoise(Sensor):
         )
 
     def std(self, image: Tensor) -> Tensor:
-        r"""Return the standard deviation of the noise in each pixel, before the clip; a fixed pattern is none.
+        r"""Return the standard deviation of the noise in each pixel, before the clip; a fixed pattern does not count.
 
         .. math:: \sqrt{\sigma^2 + (x + d / w) / w + q^2 / 12}
 

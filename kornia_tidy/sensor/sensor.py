@@ -14,14 +14,14 @@ STRIP = 64  # rows of noise drawn in one call
 
 
 class Sensor(nn.Module):
-    """Base of sensors: a subclass says what noise is drawn, and what is recorded of light with it.
+    """Base of sensors: a subclass draws noise and records light with it.
 
-    A camera takes any module with this ``forward`` and ``draw``. CONTRIBUTING has a recipe. What restores captures by
-    their noise asks for a method ``std(light)``: the standard deviation of the noise in units of full scale.
+    A camera takes any module with this ``forward`` and ``draw``. CONTRIBUTING has a recipe. Restorations that use the
+    noise call a method ``std(light)``: the standard deviation of the noise in units of full scale.
 
     Shape:
         - image: (B, C, H, W), linear light, 1.0 = full scale, float16, bfloat16, float32 or float64.
-        - Output: the same shape and dtype, computed in float32 (float64 for float64) under autocast too.
+        - Output: the same shape and dtype, also under autocast computed in float32 (float64 for float64).
 
     Example:
         >>> class Film(Sensor):
@@ -36,11 +36,11 @@ class Sensor(nn.Module):
 
     @property
     def noise(self) -> Mapping[str, Callable[..., Tensor]]:
-        """What is drawn for each value of an image: names, and functions such as ``torch.randn`` that draw."""
+        """The draws for each value of an image: names, and functions such as ``torch.randn``."""
         return {}
 
     def record(self, light: Tensor, noise: Mapping[str, Tensor], origin: tuple[int, int]) -> Tensor:
-        """Return what is recorded, in linear light.
+        """Return the record in linear light.
 
         Args:
             light: (B, C, h, w) float32 or float64, 1.0 = full scale.
@@ -64,7 +64,7 @@ class Sensor(nn.Module):
                 ``torch.compile``.
             generator: source of random numbers, in eager mode only; it may be on another device than the image.
                 Default: the global generator of the image's device.
-            origin: row and column of the sensor at the image's first pixel, by which fixed patterns are found. The
+            origin: row and column of the sensor at the image's first pixel, which places fixed patterns. The
                 noise does not depend on it.
 
         Raises:
@@ -139,7 +139,7 @@ def check_sensor(sensor: nn.Module | None) -> None:
         sensor: of a camera.
 
     Raises:
-        TypeError: if it is no module, or does not take the place of its image on the sensor.
+        TypeError: if it is not a module, or does not take the place of its image on the sensor.
 
     Example:
         >>> check_sensor(nn.Identity())

@@ -1,4 +1,4 @@
-"""What the page shows for values of its controls: pictures, legends and the script, or one sentence for a mistake."""
+"""Answers of the page to values of its controls: pictures, legends and the script, or one sentence for a mistake."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KEPT = "The pictures are those of the settings before."
 
 
 class Answer(NamedTuple):
-    """What the page shows."""
+    """Answer of the page."""
 
     message: str
     """Camera and time, or a mistake in one sentence; Markdown."""
@@ -31,14 +31,14 @@ class Answer(NamedTuple):
 
 
 def answer(values: Mapping[str, Any], tell: Tell = lambda share, stage: None) -> Answer:
-    """Return what the page shows for values of its controls.
+    """Return the page's answer to values of its controls.
 
     Args:
         values: by the names of the controls, in the units of their labels; missing ones are default.
         tell: see :func:`~kornia_tidy.cli.app.capture.take_picture`.
 
     Returns:
-        Pictures, legends and script; after a mistake a sentence alone, so that the page keeps what it shows. A fault of
+        Pictures, legends and script; after a mistake only a sentence, so that the page keeps its pictures. A fault of
         the library is printed with its traceback to standard error too, for a report.
 
     Example:

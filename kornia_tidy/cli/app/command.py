@@ -30,7 +30,7 @@ class App:
 
     Args:
         port: of the page. None: the first free one from 7860 on.
-        allow_host: names by which the page is asked for, besides localhost, 127.0.0.1 and [::1]. None: no others.
+        allow_host: names of the page in requests, besides localhost, 127.0.0.1 and [::1]. None: no others.
     """
 
     port: Annotated[int, Unit("N", "", PORTS[0], PORTS[-1])] | None = None

@@ -59,7 +59,7 @@ class Control(NamedTuple):
         """Return a value of the control as the value of the setting.
 
         Raises:
-            ValueError: if a number is missing, or is none, or not whole where it must be.
+            ValueError: if a number is missing, is not a number, or is not whole where it must be.
 
         Example:
             >>> by_name("noise").setting(0.00001), by_name("pixel_pitch").setting("3,45")

@@ -1,7 +1,7 @@
 """Guard of the page's server: which web sites may talk to it, how much they may store, and which files it hands out.
 
-A browser sends requests of any page that it shows to this machine. A foreign page is known by its ``Origin``; one whose
-name was rebound to this machine, by the ``Host`` that it asks for.
+A browser sends requests of any page that it shows to this machine. The ``Origin`` shows a foreign page, the ``Host`` a
+page with a name rebound to this machine.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ ELSEWHERE = ("/gradio_api/proxy=", "/gradio_api/run-history")  # Gradio's reques
 
 
 def host_name(text: str) -> str:
-    """Return the name of a host as it stands in requests.
+    """Return the name of a host in the form of requests.
 
     Raises:
-        ValueError: if it is no name or address, or has a scheme or port.
+        ValueError: if it is not a name or address, or has a scheme or port.
 
     Example:
         >>> host_name("Lab.Example"), host_name("fe80::1")
@@ -49,8 +49,8 @@ def host_name(text: str) -> str:
 class Guard:
     """ASGI application around that of the page.
 
-    Requests for other hosts get 421, those of other sites 403, those that are too large 413. Uploads remove the oldest
-    ones if all files together would be more than 1 GiB; what is in the folder at first stays.
+    Requests for other hosts get 421, those of other sites 403, too large ones 413. Uploads remove the oldest
+    ones if all files together would be more than 1 GiB; files that were in the folder before stay.
 
     Args:
         application: of the page.
@@ -151,7 +151,7 @@ class Guard:
         """Pass a request on, as long as its body is small enough and there is room for it."""
         most = LARGEST_UPLOAD if scope["path"].rstrip("/") == UPLOAD else LARGEST_MESSAGE
         told = headers.get("content-length", [""])[0]
-        in_chunks = most if "transfer-encoding" in headers else 0  # whose number is not told
+        in_chunks = most if "transfer-encoding" in headers else 0  # of unknown number
         size = int(told) if told.isdecimal() else in_chunks
         if size > most:
             await _refuse(scope, send, 413, f"a request must be at most {most} bytes, got {size}")

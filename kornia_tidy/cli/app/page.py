@@ -125,7 +125,7 @@ def updates(found: Answer, folder: Path) -> list[Any]:
 
 
 def script_file(script: str, folder: Path) -> str:
-    """Write a script to a file named ``capture.py`` in a folder of its own, and return the path."""
+    """Write a script to a file named ``capture.py`` in a separate folder, and return the path."""
     path = folder / hashlib.sha256(script.encode()).hexdigest()[:16] / "capture.py"
     path.parent.mkdir(exist_ok=True)
     write_bytes(path, script.encode())

@@ -158,7 +158,7 @@ def _text(value: str) -> str:
 
 
 def _call(function: str, arguments: list[str]) -> str:
-    """Return a call in one line, or with its arguments in lines of their own if it is long."""
+    """Return a call in one line, or with one line for each argument if it is long."""
     line = f"{function}({', '.join(arguments)})"
     if len(line) <= 100:
         return line

@@ -53,7 +53,7 @@ class Settings:
             :func:`~kornia_tidy.masks.initial_heights.initial_heights`.
         masks: number K of its masks in one exposure.
         mask_seed: of the noise of masks.
-        compositing: ``"gather"``, ``"scatter"``, ``"occlusion"``, or ``"system"`` for what the system was made for.
+        compositing: ``"gather"``, ``"scatter"``, ``"occlusion"``, or ``"system"`` for the compositing of the system.
         noise: standard deviation of the read noise, in units of full scale.
         noise_seed: of the noise.
 

@@ -75,7 +75,7 @@ class Design:
         quick: fewer steps and scenes: a first answer, in 20 s on one core.
         seed: of all that is random.
         scenes: pictures with depth, which decide beside dead leaves; FOLDER/rgbd.json pairs them: {"image": "*.png",
-            "depth": "*_depth.png", "scale": 0.001}. None: dead leaves alone.
+            "depth": "*_depth.png", "scale": 0.001}. None: only dead leaves.
         given: scene, lens and sensor.
         modulator: what shows the masks.
     """

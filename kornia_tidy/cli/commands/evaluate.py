@@ -21,7 +21,7 @@ class Evaluate:
 
     A trained camera and network, or the closed form of a camera that was measured, is
     evaluated on scenes that were not used for training. With --psfs and --noise the captures are
-    those of the measured camera, and a network that deconvolves them is told its PSFs. FOLDER
+    those of the measured camera, and a network that deconvolves them uses its PSFs. FOLDER
     gets results.csv (one line per scene), summary.json (means and settings), and pictures of
     the first scenes: capture, estimates, ground truth, and errors times 3.
 
@@ -41,7 +41,7 @@ class Evaluate:
         system: best.safetensors or last.safetensors of a run; a shipped system; or, with PSFs, a closed form, which
             needs no training.
         output: made if missing. None: evaluation, beside the system.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, which takes the captures. None: those of the
+        psfs: file of kornia-tidy raw calibrate-psf; the measured camera takes the captures. None: those of the
             system's camera.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: that of the training.

@@ -28,7 +28,7 @@ def camera_and_lens(lens: str | None, settings: LensSettings) -> tuple[ThinLensC
 
     Raises:
         FileNotFoundError: if the lens is neither a name nor a file.
-        ValueError: if an option says what the lens has of its own, or the file is none of a lens.
+        ValueError: if an option contradicts the lens, or the file does not hold a lens.
     """
     from kornia_tidy.optics.lens.first_order import first_order
     from kornia_tidy.optics.lens.lens import Lens
@@ -61,7 +61,7 @@ def camera_and_lens(lens: str | None, settings: LensSettings) -> tuple[ThinLensC
 
 
 def _refuse(lens: str, given: list[str], own: tuple[str, ...]) -> None:
-    """Raise ``ValueError`` if an option was given for what a lens has of its own."""
+    """Raise ``ValueError`` if an option was given for a property of the lens."""
     for name in given:
         if name in own:
             raise ValueError(f"the lens {lens} has its own: leave out --{name.replace('_', '-')}")

@@ -61,7 +61,7 @@ class Timing:
         exposure: of a capture. None: as saved, or 0.1.
         switching_time: of a swap. None: as saved, or 0.
         dwell: share of each mask. None: as saved, or equal.
-        cyclic: the swap back to the first falls into the exposure too.
+        cyclic: the swap back to the first also falls into the exposure.
     """
 
     exposure: Seconds | None = None
@@ -115,9 +115,9 @@ class ShowMasks:
 class ExportMasks:
     """Write SLM frames, heights or STL.
 
-    A state_dict tells the masks' family, constraint and material, and the modulator, whose
-    grey levels, dwell and switching times are the defaults of frames. One of masks alone
-    (phase in radians at 530 nm) tells none of them. The name of OUT gives the format:
+    A state_dict tells the masks' family, constraint and material, and the modulator; its
+    grey levels, dwell and switching times are the defaults of frames. One of only masks (phase in radians at 530 nm)
+    lacks them. The name of OUT gives the format:
       a folder  one frame per mask for the panel of a phase modulator (PNG or TIFF),
                 timing.csv, and frames.json with the settings needed to read them
                 back; up to 8 bits in 8-bit files, 9 and 10 in the least
@@ -130,7 +130,7 @@ class ExportMasks:
         masks: heights in metres (.npy, K x rows x columns), a camera's state_dict, or a checkpoint (.safetensors).
         output: a folder, x.npy or x.stl.
         material: what turns height into phase. None: as saved, or constant, index 1.5 at every wavelength.
-        force: replace what was written before.
+        force: replace earlier files.
         pupil_radius: of the pupil on the panel or the plate; the mask is 2.3 radii wide. None: on a panel the largest
             with a whole number of panel pixels per mask pixel.
         panel: of frames.
@@ -202,7 +202,7 @@ class ExportMasks:
         tell("panel", f"{width} x {height} px, {scale:.6g} a mask pixel{uneven}")
         tell("pupil", f"radius {placement.radius(size) * 1e3:.4g} mm on the panel")
         tell("frames", _frames_in_words(frames))
-        # By the panel's phases and the masks themselves, and not by what the sidecar says of both.
+        # By the panel's phases and the masks themselves, not by the sidecar's description.
         wanted = heights * metres_to_radians(saved.material, asked.wavelength)
         error, share = read_slm_frames(self.output).phase_error(wanted, levels.levels)
         tell("check", f"read back, phase differs by up to {error:.3g} rad, {share / 2:.3f} grey levels, 0.5 allowed")
@@ -272,7 +272,7 @@ def _material(name: str | None) -> Material | None:
 
 
 def _saved(path: str, name: str | None) -> SavedMasks:
-    """Return the masks of a file, and what it says of them."""
+    """Return the masks of a file and their description."""
     from kornia_tidy.lab.mask_export.mask_files import SavedMasks, masks_in_state, read_heights
     from kornia_tidy.reconstruction.trained import camera_state
 

@@ -3,7 +3,7 @@
 A command is a dataclass of settings with a method ``run`` and, if it likes, two class variables: ``examples``, and
 ``basic`` names, without which an option stands in ``--help-all`` only. A field that is a dataclass itself is a group of
 options; a field ``Annotated[dict, Given(Settings)]`` holds those of the settings that were given, by name. The field
-``output`` is ``-o`` too.
+``output`` is also ``-o``.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class Given:
 
 @dataclass(frozen=True)
 class Argument(Unit):
-    """Unit of a setting that is no option: its value is recognised by its place."""
+    """Unit of a setting that is not an option: its value is recognised by its place."""
 
 
 @dataclass(frozen=True)
 class Parsed(Unit):
-    """Unit of a value that a function reads from a word; it raises ``ValueError`` for what it cannot read."""
+    """Unit of a value that a function reads from a word; it raises ``ValueError`` for unreadable words."""
 
     read: Callable[[str], Any] = str
 
@@ -63,10 +63,10 @@ class Optional(Unit):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that raises ``ValueError``, and whose help does not vanish where nothing can be written."""
+    """A parser that raises ``ValueError``, and keeps its help where nothing can be written."""
 
     def error(self, message: str) -> NoReturn:
-        """Say in a sentence what is wrong, and what was perhaps meant."""
+        """Name the mistake in a sentence, and suggest a similar word."""
         message = re.sub(r"^argument (?:-\w/)?(\S+):", r"\1", message)
         if message.startswith("unrecognized arguments: "):
             word = message.split()[2].partition("=")[0]
@@ -80,7 +80,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """Texts as they are, and options whose names are not broken."""
+    """Unchanged texts, and options with unbroken names."""
 
     def _split_lines(self, text: str, width: int) -> list[str]:
         return textwrap.wrap(text, width, break_on_hyphens=False)
@@ -151,7 +151,7 @@ def _words(setting: Setting) -> list[str]:
 
 
 def _options(setting: Setting, given: Given | None) -> dict[str, Any]:
-    """Return what argparse is told of an option, without its help."""
+    """Return argparse's arguments of an option, without its help."""
     options: dict[str, Any] = {}
     if not isinstance(setting.unit, Argument):
         options |= {"dest": setting.name, "required": setting.default is MISSING and given is None}
@@ -208,7 +208,7 @@ def _shown(value: Any, unit: Unit) -> str:
 
 
 def _value(setting: Setting, word: str) -> Any:
-    """Return the value of an option that a word stands for."""
+    """Return the value of an option from a word."""
     if isinstance(setting.unit, Parsed):
         try:
             return setting.unit.read(word)

@@ -76,7 +76,7 @@ class Psf:
         window: side of the PSFs, odd. None: as in a capture.
         fidelity: speed or accuracy. None: balanced, or as saved.
         mask_seed: of a system's masks.
-        settings: for --lens with a name or surfaces, and for a file of masks alone; other cameras have their own.
+        settings: for --lens with a name or surfaces, and for a file with only masks; other cameras have their own.
         lens: a real lens by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json). None: an ideal
             lens, or as saved.
         field: number of heights on the sensor from the axis to the corner that the lens is made for. None: the axis.

@@ -32,7 +32,7 @@ class CalibrateNoise:
         output: where the calibration goes, OUT.json.
         dark: captures without light: black is measured in them. None: black as the files say.
         plot: draw the photon-transfer curve, without a name as OUT.png beside OUT.json. None: it is not drawn.
-        dump: what a headerless file holds.
+        dump: layout of a headerless file.
     """
 
     files: RawFiles

@@ -47,7 +47,7 @@ class CalibratePsf:
         diameter: of the point of light.
         sensor: its noise.
         lens: of the camera; its depths are the distances.
-        dump: what a headerless file holds.
+        dump: layout of a headerless file.
     """
 
     files: RawFiles

@@ -29,15 +29,15 @@ class DevelopRaw:
         output: where to; made if it is not there.
         format: of the 16-bit picture.
         no_preview: no JPEG beside it.
-        resume: keep pictures that are there, develop the others.
+        resume: keep existing pictures, develop the others.
         demosaic: method. None: LibRaw's AHD for Bayer, Markesteijn's for X-Trans, else bilinear.
-        white_balance: as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour.
+        white_balance: as-shot, daylight, auto (bright areas are grey on average), none, or a factor for each colour.
             None: as shot, else daylight, else none.
         highlights: clip all channels where the first saturates, or keep what others saw above.
         adaptation: chromatic adaptation of eyes. None: only the white balance, as LibRaw.
         linear: linear light in the 16-bit picture, not encoded as sRGB.
         sensor_grid: pixels as on the sensor: neither turned nor stretched.
-        dump: what a headerless file holds.
+        dump: layout of a headerless file.
     """
 
     files: RawFiles

@@ -21,7 +21,7 @@ class InfoOfRaw:
     Args:
         files: camera raw files.
         json: print one JSON array, an object for each file.
-        dump: what a headerless file holds.
+        dump: layout of a headerless file.
     """
 
     files: RawFiles

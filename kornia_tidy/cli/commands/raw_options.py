@@ -64,7 +64,7 @@ class Dump:
         """Open a raw file, or the dump that the options describe.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if it cannot be read, or the options do not describe a dump.
         """
         from kornia_tidy.lab.raw.capture import RawCapture

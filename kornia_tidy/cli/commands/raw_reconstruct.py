@@ -43,16 +43,16 @@ class ReconstructRaw:
         output: where to; made if it is not there.
         head: a shipped system, or a checkpoint of a training (best.safetensors), or, with PSFs, a closed form. None:
             with PSFs wiener-bilateral.
-        psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, by which captures are deconvolved. None:
+        psfs: file of kornia-tidy raw calibrate-psf; its PSFs deconvolve the captures. None:
             those of the network's camera.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
-        resume: skip files whose results are there and still right.
+        resume: skip files with valid results.
         format: of the 16-bit picture.
         depth_unit: of FILE_depth.png.
         linear: FILES that are pictures hold linear light, not sRGB.
-        white_balance: as-shot, daylight, auto (what is bright is grey on average), none, or a factor for each colour.
+        white_balance: as-shot, daylight, auto (bright areas are grey on average), none, or a factor for each colour.
             None: as shot, else daylight, else none.
         jobs: files at a time.
         memory: for the network's tiles, of all jobs.
@@ -62,7 +62,7 @@ class ReconstructRaw:
             of edof systems are about 0.1 dB better, the depth of joint-uncertain 2 % less wrong, in 6 to 7 times the
             time.
         device: where the network runs, such as cuda.
-        dump: what a headerless file holds.
+        dump: layout of a headerless file.
     """
 
     files: RawFiles
@@ -131,7 +131,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         from kornia_tidy.reconstruction.head import takes_noise
         from kornia_tidy.reconstruction.light_head import LightHead
 
-        white_balance(self.white_balance)  # refuses what is none
+        white_balance(self.white_balance)  # refuses other values
         if self.noise == 0:
             raise ValueError("noise must be positive and finite in units of full scale, got 0.0")
         sensor, _ = read_noise(self.noise)

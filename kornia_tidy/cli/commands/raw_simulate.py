@@ -31,9 +31,9 @@ class SensorOptions(SensorInElectrons):
     That of a raw file, or one given in words.
 
     Args:
-        like: raw file whose filter array, levels and colours are taken. None: the sensor is given in words.
+        like: raw file that gives filter array, levels and colours. None: the sensor is given in words.
         pattern: filter array's tile, by rows. None: RGGB.
-        bits: of the converter, whose white is 2^bits - 1. None: 12.
+        bits: of the converter; white is 2^bits - 1. None: 12.
         black: count without light. None: 2^bits / 16.
         white: saturation count, replaces that of the file of like. None: as the file of like says, or by bits.
         color: camera: the picture's colours are seen through the camera's filters, by its matrix and white balance;
@@ -65,7 +65,7 @@ class SimulateRaw:
     Args:
         output: DNG to write.
         image: picture: PNG, JPEG, TIFF or NPY. None: another target.
-        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR. None: there is no picture.
+        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR. None: there is not a picture.
         flat: instead: an evenly lit sheet, of full scale; 0: the lens cap. None: another target.
         points: instead: points of light in a sheet. None: another target.
         distance: of the points. None: there are no points.

@@ -30,7 +30,7 @@ class Files:
     """Files.
 
     Args:
-        beside: what lies beside the coded image.
+        beside: pictures beside the coded image.
         float32: images as NPY, not as 16-bit PNG.
         shard_items: tar files of so many captures, not folders. None: a folder for each.
         shard_megabytes: tar files of about this size, judged by the first capture. None: a folder for each.
@@ -71,7 +71,7 @@ class Render:
             split's.
         preset: a published system; only noise, fidelity, compositing and border can be given beside it. None: a camera
             of the options below.
-        checkpoint: best.safetensors of a training, whose scenes are the defaults. None: a camera of the options below.
+        checkpoint: best.safetensors of a training; its scenes are the defaults. None: a camera of the options below.
         psfs: the camera whose PSFs kornia-tidy raw calibrate-psf measured, with lens, masks and distances. None:
             computed for lens and masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw

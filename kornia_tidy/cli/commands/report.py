@@ -44,7 +44,7 @@ class Stages:
 
 
 def progress_bar(what: str, **options: Any) -> tqdm:
-    """Return a bar of progress on standard error, which vanishes at the end; none where that is no terminal."""
+    """Return a bar of progress on standard error, which vanishes at the end; none where that is not a terminal."""
     return tqdm(desc=what, file=sys.stderr, leave=False, **{"disable": None, **options})
 
 

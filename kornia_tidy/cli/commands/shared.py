@@ -45,7 +45,7 @@ class DepthFile:
     Args:
         depth_scale: metres (or pixels of disparity) per stored unit; 0.001 for a 16-bit file in millimetres, 0.0002 for
             TUM's 5000 units per metre.
-        depth_kind: what is stored.
+        depth_kind: stored quantity.
         invalid: stored values that mean 'unknown', such as inf. NaN and a stored integer 0 always do. Unknown pixels
             take the depth of their nearest known neighbour. None: no others.
         focal_px: for disparity: focal length of the stereo pair. None: unknown.
@@ -185,14 +185,14 @@ class CameraSettings:
     psfs: File | None = None
 
     def optics(self, scene: Scene | None, **options: Any) -> TiDyOptics:
-        """Return the camera: that which was measured, or one of lens and masks.
+        """Return the camera: the measured one, or one of lens and masks.
 
         Args:
             scene: for ``--fit-depth``, if there is one.
             options: further ones of :class:`~kornia_tidy.TiDyOptics`.
 
         Raises:
-            ValueError: if ``--psfs`` comes with an option for what was measured with them.
+            ValueError: if ``--psfs`` comes with an option for a measured property.
         """
         import torch
 
@@ -233,10 +233,10 @@ def refuse_with_psfs(given: Iterable[str]) -> None:
 
 
 def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTransfer | None]:
-    """Return the sensor of ``--noise``, and the calibration if it was measured; None for what was not given.
+    """Return the sensor of ``--noise``, and the calibration if it was measured; None for a missing one.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file holds no calibration of the noise.
     """
     if given is None:

@@ -32,7 +32,7 @@ class Simulate:
         fidelity: speed or accuracy.
         compositing: gather: each pixel collects light through its own depth's PSF, as the paper; scatter: each spreads
             its light, which conserves it; occlusion: near things hide far ones, slowest.
-        border: what lies beyond the picture; valid crops it to where all is known.
+        border: continuation of the picture beyond its edges; valid crops the capture instead.
         color_space: srgb: decoded to linear light and encoded after; linear: is light already; paper: sRGB taken for
             light, as the paper does. None: srgb, or paper with that fidelity.
         file: how the depth is stored.

@@ -43,7 +43,7 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
         sensor: measured noise. None: the system's own.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if neither a system nor PSFs are given, a file is of another kind, or the PSFs are not of the
             system's lens and depths.
     """
@@ -62,7 +62,7 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
 
 
 def digests(head: str | None, *files: str | float | None) -> dict[str, Any]:
-    """Return what a system was made of, to recognise results of the same one: digests of files, and numbers."""
+    """Return the ingredients of a system, to recognise its results: digests of files, and numbers."""
     named = () if head is None or head in CLOSED_FORMS else (str(head_file(head)),)
     read = [hashlib.sha256(read_bytes(f)).hexdigest() if isinstance(f, str) else f for f in (*named, *files)]
     return {"head": head, "files": read}

@@ -22,7 +22,7 @@ class Trade:
 
     The speed-accuracy trade-off is measured on one scene and this machine. Each setting of
     the fidelity is varied alone from a preset. The presets, and the plans for this scene
-    within errors of 1e-1 to 1e-6, are measured too. For each point the table has the
+    within errors of 1e-1 to 1e-6, are also measured. For each point the table has the
       error    of the noise-free capture in linear light, full scale 1, against the preset
                'reference', which is rendered once
       time     of a capture after a change of the masks (PSFs and rendering), and with
@@ -35,8 +35,8 @@ class Trade:
         seed: of the scene made here.
         knobs: settings that are varied. None: all of them.
         base: preset of the other settings.
-        reference: preset to which errors refer; balanced is faster on a large scene.
-        training: captures with gradients to the masks too.
+        reference: preset that errors refer to; balanced is faster on a large scene.
+        training: also captures with gradients to the masks.
         repeats: timed runs of each.
         device: cpu, cuda or cuda:N.
         scene: that is captured.

@@ -44,15 +44,14 @@ class Train:
 
     The network reads the captures of the masks' camera. It gives an image in focus
     everywhere (edof), a depth map (depth), or both (joint). With --learn network it
-    learns behind masks that stay as they start or are designed; each scene is then
-    rendered once, and a step costs what the network costs. FOLDER gets checkpoints,
-    scores and pictures; --resume goes on after an interruption.
+    learns behind fixed masks; each scene is then rendered once, and a step takes only the network's time. FOLDER gets
+    checkpoints, scores and pictures; --resume goes on after an interruption.
 
     Args:
         output: made if missing.
         resume: go on with the run in FOLDER, if there is one, with its settings.
         head_from: begin with the network of another run. None: new weights.
-        refiner_from: begin the second network of refined with that of a run for the image alone. None: new weights.
+        refiner_from: begin the second network of refined with that of a run for the image only. None: new weights.
         masks_from: begin with the masks of another run, or of a camera that was saved. None: by start.
         design_from: lens, depth range and masks that kornia-tidy design recommends in FOLDER; options given here go
             first. None: no design.
@@ -196,7 +195,7 @@ Defaults of --learn network, which are for a CPU:
             say("", str(folder / name))
 
     def _settings(self, stored: Path) -> tuple[TrainingSettings, PSFBank | None]:
-        """Return the settings of the run: stored ones, with what was given, or usual ones; and measured PSFs."""
+        """Return the settings of the run: stored ones with the given changes, or usual ones; and measured PSFs."""
         from kornia_tidy.training.design_folder import designed_settings
 
         measured, psfs = measured_system(self.psfs, self.noise, self.settings)

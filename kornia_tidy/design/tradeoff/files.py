@@ -47,7 +47,7 @@ def read_json(path: str | os.PathLike[str]) -> TradeRun:
     """Read a sweep written by :func:`write_json`, with a check of every name and type.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is not a sweep, or has the schema of another version.
     """
     data = read_bytes(path)
@@ -84,7 +84,7 @@ def read_csv(path: str | os.PathLike[str]) -> list[TradeRow]:
     """Read rows written by :func:`write_csv`.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if its columns or values are not those of a sweep.
     """
     text = read_text(path)
@@ -232,7 +232,7 @@ def known_rows(folder: str | os.PathLike[str], conditions: Conditions) -> tuple[
     """Return the rows of an earlier run in a folder that are still valid, and a remark about them.
 
     Raises:
-        ValueError: if ``trade.json`` there is no sweep.
+        ValueError: if ``trade.json`` there is not a sweep.
     """
     path = Path(folder) / "trade.json"
     if not path.exists():

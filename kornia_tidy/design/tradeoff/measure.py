@@ -71,7 +71,7 @@ def scene_settings(
         optics: the camera.
         image: (C, H, W), in the colour space of the camera.
         depth: (1, H, W), metres.
-        base: preset or fidelity whose settings are varied, each alone.
+        base: preset or fidelity; its settings are varied one at a time.
         knobs: names of settings; ``"preset"`` for the presets, ``"plan"`` for the plans.
 
     Raises:
@@ -101,7 +101,7 @@ def sweep(
     reference: str | Fidelity = "reference",
     known: Iterable[TradeRow] = (),
 ) -> Iterator[TradeRow]:
-    """Measure settings one after another, and yield each row as soon as it is measured.
+    """Measure settings one after another, and yield each row when it is measured.
 
     Args:
         optics: the camera: its masks, lens, modulator, spectrum, compositing and border, on the device to measure.
@@ -110,7 +110,7 @@ def sweep(
         depth: its depth, (1, H, W) or (B, 1, H, W).
         settings: points of the sweep, see :func:`~kornia_tidy.design.tradeoff.sweep_settings.sweep_settings`.
         repeats: timed runs of each.
-        training: measure captures with gradients too.
+        training: also measure captures with gradients.
         reference: the fidelity to which errors refer.
         known: rows measured earlier under the same conditions; their settings are not measured again.
 
@@ -172,7 +172,7 @@ def measure(
         fidelity: the setting.
         truth: the reference capture from :func:`capture`.
         repeats: timed runs.
-        training: measure the capture with gradients too.
+        training: also measure the capture with gradients.
 
     Raises:
         ValueError: if ``truth`` has another shape than the image, repeats are not positive, or the masks have no

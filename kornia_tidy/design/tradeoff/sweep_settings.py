@@ -1,4 +1,4 @@
-"""Settings of a sweep: the presets, each setting of the fidelity varied alone, and plans."""
+"""Settings of a sweep: the presets, each setting of the fidelity varied by itself, and plans."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def sweep_settings(base: str | Fidelity = "balanced", knobs: Sequence[str] = tup
     since a smaller window could not hold the light.
 
     Args:
-        base: a preset's name, or the fidelity whose settings are varied.
+        base: a preset's name, or the fidelity with the varied settings.
         knobs: names of settings from ``SWEEP_VALUES``; ``"preset"`` for the presets.
 
     Raises:

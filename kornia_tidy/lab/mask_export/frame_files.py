@@ -192,7 +192,7 @@ def _read_turns(path: Path) -> np.ndarray:
     """Read the whole waves of masks from an NPY file.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file is damaged or its values are not int16.
     """
     try:

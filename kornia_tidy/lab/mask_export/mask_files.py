@@ -30,11 +30,11 @@ from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.tensor_files import read_tensors
 
 SUFFIXES = (".npy", ".safetensors")
-_KEYS = ("masks.phase", "phase")  # in the state of a camera, and in that of masks alone
+_KEYS = ("masks.phase", "phase")  # in the state of a camera, and in that of masks
 
 
 class SavedMasks(NamedTuple):
-    """Masks of a file: their heights, and what the file says of their material and of the modulator that shows them."""
+    """Masks of a file: their heights, and the file's description of their material and modulator."""
 
     heights: Tensor
     """(K, rows, columns) metres, float64, with the constraint applied."""
@@ -84,7 +84,7 @@ class SavedMasks(NamedTuple):
             exposure: seconds. Default: as saved, or 0.1.
             switching_time: seconds of a swap. Default: as saved, or 0.
             dwell: share of each mask. Default: as saved, or equal.
-            cyclic: the swap back to the first falls into the exposure too.
+            cyclic: the swap back to the first also falls into the exposure.
 
         Raises:
             ValueError: if there are other numbers of shares and masks.
@@ -105,11 +105,11 @@ def masks_in_state(state: Mapping[str, Tensor], material: Material | None = None
     """Return the masks of a camera's state: of any family, with its constraint, range of phase and material.
 
     Args:
-        state: of a camera; or ``masks.phase`` or ``phase`` in radians at 530 nm alone, taken as they are.
-        material: of masks whose state does not tell it. Default: index 1.5, the default of masks.
+        state: of a camera; or ``masks.phase`` or ``phase`` in radians at 530 nm, unchanged.
+        material: of masks with a state that lacks it. Default: index 1.5, the default of masks.
 
     Raises:
-        ValueError: if there are no masks, their family is none of this package, or they are of another material.
+        ValueError: if there are no masks, their family is unknown, or they are of another material.
 
     Example:
         >>> from kornia_tidy import DwellTimes, TiDyOptics
@@ -150,19 +150,19 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
 
     Args:
         path: NPY file of heights in metres, (K, rows, columns) or (rows, columns); or safetensors file with the
-            ``state_dict`` of a camera with masks of any family, or with ``phase`` in radians at 530 nm alone.
+            ``state_dict`` of a camera with masks of any family, or with only ``phase`` in radians at 530 nm.
         material: for the conversion of radians to metres, where the state does not tell it. Default: index 1.5.
 
     Returns:
         (K, rows, columns) metres, float64, with the constraint of the masks applied.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the suffix is another, the file is damaged or has no masks, a height is not finite, or the masks
             are of another material.
 
     Convention:
-        - The state of masks alone includes neither constraint nor material: save the camera's.
+        - The state of only the masks includes neither constraint nor material: save the camera's.
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)

@@ -39,7 +39,7 @@ class PanelPlacement:
     Convention:
         - Rows count downwards. Without flip and rotation, a phase that increases to larger columns of the panel moves
           the PSF to larger columns of the image. Use flip and rotate if the mirrors and lenses of a setup change this.
-        - A panel pixel whose centre lies on the edge of two blocks belongs to the right or lower one. So if an odd
+        - A panel pixel with its centre on the edge of two blocks belongs to the right or lower one. So if an odd
           number of panel pixels is left over, the mask lies half a pixel left of or above the centre.
 
     Example:

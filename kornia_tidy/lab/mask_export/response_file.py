@@ -13,7 +13,7 @@ from kornia_tidy.files import read_text
 from kornia_tidy.modulator.phase_panel import check_response
 
 LONGEST = 1000  # characters of a line of the header that count
-SHORT = 3.0  # rad; a smaller span is no whole wave, and in units of pi it is what panels have
+SHORT = 3.0  # rad; a smaller span is not a whole wave, and in units of pi panels have it
 RADIANS = {"radians": 1.0, "milliradians": 1e-3, "degrees": math.pi / 180, "pi": math.pi, "waves": 2 * math.pi}
 # Words of a header, in lower case.
 _UNITS = {
@@ -51,13 +51,13 @@ def read_response(path: str | os.PathLike[str], bits: int) -> list[float]:
         The :math:`2^b` phases in radians.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if a level is missing, given twice or not of the panel, or
             :func:`~kornia_tidy.modulator.phase_panel.check_response` does; the message names the line.
 
     Convention:
-        - Text before the first row, and what follows ``#`` or ``%``, is header. Its words *deg*, *degrees*, *°*,
-          *mrad*, *pi*, *π*, *waves* and *2 pi* are units of the phases where they stand beside *phase* or alone.
+        - Text before the first row and after ``#`` or ``%`` is header. Its words *deg*, *degrees*, *°*,
+          *mrad*, *pi*, *π*, *waves* and *2 pi* are units of the phases beside *phase* or on their own.
           Without, phases are radians.
         - A warning tells of a span of less than 3 rad, as phases in another unit have.
 
@@ -154,7 +154,7 @@ def _punctuation(rows: Sequence[str], header: Sequence[_Row]) -> tuple[str, str]
 
 
 def _names_phases(text: str) -> bool:
-    """Return whether a line of a header names the column of phases, or units and levels alone."""
+    """Return whether a line of a header names the column of phases, or only units and levels."""
     return bool(re.search(_PHASE, text)) or not re.search(r"[^\W\d_]", re.sub("|".join(_UNITS.values()), "", text))
 
 

@@ -22,7 +22,7 @@ class SLMFrames:
     r"""Grey levels of a panel for K masks, with the parameters that convert them back to heights.
 
     A height h has the phase :math:`\phi = 2 \pi h (n(\lambda) - 1) / \lambda` at the working wavelength λ. The panel
-    shows the level whose phase :math:`\phi_g` is nearest modulo 2π, so :math:`\phi \approx \phi_g + 2 \pi t`. The t
+    shows the level with the nearest phase :math:`\phi_g` modulo 2π, so :math:`\phi \approx \phi_g + 2 \pi t`. The t
     whole waves have no effect at λ, and the panel does not show them.
 
     Args:
@@ -61,7 +61,7 @@ class SLMFrames:
             panel: grey levels of the panel. Their phases are taken to be those at ``wavelength``, at which panels are
                 calibrated, and not those at 530 nm.
             wavelength: working wavelength in metres, at which the frames have the phase of the masks.
-            material: material of the heights. Default: that of the masks; index 1.5 for heights alone.
+            material: material of the heights. Default: that of the masks; index 1.5 for heights without material.
 
         Raises:
             TypeError: if heights are not a floating-point tensor.

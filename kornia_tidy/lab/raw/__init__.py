@@ -1,4 +1,4 @@
-"""Camera raw files: decoding in a process of its own, tags, colour, demosaicing, and simulated raw files.
+"""Camera raw files: decoding in a separate process, tags, colour, demosaicing, and simulated raw files.
 
 A raw file comes in; a capture with its levels and filter array goes out (``capture.py``, read it first), which
 ``develop.py`` turns into a picture. ``simulation.py`` goes the other way.

@@ -32,7 +32,7 @@ def auto_balance(raw: RawCapture) -> Tensor:
     Assumes:
         The bright parts of the scene are grey on average. For a meadow this is wrong: it turns out too pink.
 
-    Source: Finlayson and Trezzi, Shades of gray and colour constancy, CIC 2004, whose best norm is 6.
+    Source: Finlayson and Trezzi, Shades of gray and colour constancy, CIC 2004, with 6 as the best norm.
 
     Example:
         >>> import torch

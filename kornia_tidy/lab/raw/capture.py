@@ -117,7 +117,7 @@ class RawCapture:
             memory_limit: bytes of memory that decoding may use.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if it is empty, damaged, cut short, not a raw file, of a kind that LibRaw does not decode,
                 without a picture, or too much for the limits.
 
@@ -128,7 +128,7 @@ class RawCapture:
 
         Convention:
             - The counts cover the visible area without the masked borders. A tone curve of the file is inverted.
-            - Floating-point samples are returned as they are stored.
+            - Floating-point samples are returned unchanged.
             - Where the black levels of a DNG repeat over a larger tile than its filter array, or differ by row or
               column, or its planes differ in white, the counts are rescaled to one black level for each place and one
               white level, and rounded.
@@ -173,7 +173,7 @@ class RawCapture:
             byte_order: ``"little"`` or ``"big"``.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if the file's length is not that of these counts, or they are implausible.
 
         Warns:

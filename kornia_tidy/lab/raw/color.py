@@ -84,11 +84,11 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
     Args:
         matrix: colour matrix for daylight, (3, n), from :func:`camera_to_srgb`.
         daylight: white balance factors for daylight, (n,), from :func:`camera_to_srgb`.
-        balance: factors (n,) by which the colours were multiplied, assumed to map the illuminant to white.
+        balance: factors (n,) applied to the colours, assumed to map the illuminant to white.
         adaptation: a transform of colour-science: ``"Bradford"``, ``"CAT02"``, ``"CAT16"`` or ``"Von Kries"``.
 
     Raises:
-        ValueError: if there is no such transform, or the factors give an illuminant with a negative XYZ.
+        ValueError: if there is not a such transform, or the factors give an illuminant with a negative XYZ.
 
     Example:
         >>> matrix, daylight = torch.eye(3), torch.ones(3)

@@ -69,7 +69,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
         memory_limit: bytes that the decoding process may use.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file cannot be decoded within these limits.
 
     Warns:
@@ -118,7 +118,7 @@ def source_bytes(source: Source) -> bytes:
     """Return the bytes of a source.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is a folder or empty.
     """
     with _opened(source) as file:

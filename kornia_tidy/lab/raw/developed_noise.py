@@ -20,7 +20,7 @@ LEAST = 1e-12  # variance, in units of full scale squared
 def developed_noise(
     raw: RawCapture, white_balance: str | Tensor | None = None, sensor: SensorNoise | None = None
 ) -> SensorNoise | None:
-    r"""Return the sensor whose noise is that of a developed picture, the mean of its three colours.
+    r"""Return the sensor with the noise of a developed picture, the mean of its three colours.
 
     White balance g and colour matrix M turn the variance :math:`S x + O` of the sensor's values into that of linear
     sRGB. In grey light l it is

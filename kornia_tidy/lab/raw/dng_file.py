@@ -25,7 +25,7 @@ def write_dng(path: str | os.PathLike[str], raw: RawCapture) -> None:
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if the capture is empty, or a count is no whole number of 16 bits.
+        ValueError: if the capture is empty, or a count is not a whole number of 16 bits.
     """
     write_bytes(path, encode_dng(raw))
 

@@ -1,4 +1,4 @@
-"""Points of light on a sensor: what a calibration of PSFs photographs, simulated between the pixels."""
+"""Points of light on a sensor: targets of a calibration of PSFs, simulated between the pixels."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def points_of_light(
     point's light reaches as far as its cell of the grid.
 
     Args:
-        optics: a :class:`~kornia_tidy.TiDyOptics` whose PSFs are computed, with a lens in metres.
+        optics: a :class:`~kornia_tidy.TiDyOptics` with computed PSFs and a lens in metres.
         distance: in metres.
         count: number of points.
         size: rows and columns of the sensor.

@@ -34,7 +34,7 @@ def demosaic_quantised(
         mosaic: (N, H, W), finite.
         compute: the algorithm, (rows, W) to (rows, W, colors), unsigned integers; called by several threads at once.
         bits: 8 or 16.
-        matrix: (C, colors), applied to the colours as they are converted back to real values.
+        matrix: (C, colors), applied to the colours during their conversion back to real values.
         reach: number of rows, even, that influence a row on either side. Bands of rows are then computed in parallel
             with the same result. None: the algorithm has no bounded reach, and the whole mosaic is one band.
 

@@ -63,11 +63,11 @@ def simulated_sensor(pattern: str = "RGGB", bits: int = 12, black: float | None 
 
     Args:
         pattern: colours of the filter array's tile, by rows.
-        bits: of the converter, whose white is 2^bits - 1.
+        bits: of the converter; white is 2^bits - 1.
         black: count without light. Default: 2^bits / 16.
 
     Raises:
-        ValueError: if there is no such filter array, or black is not below white.
+        ValueError: if there is not a such filter array, or black is not below white.
 
     Example:
         >>> sensor = simulated_sensor("GBRG", bits=14)
@@ -103,7 +103,7 @@ def simulate_scene(
         generator: random number generator. Default: the global generator.
 
     Raises:
-        ValueError: if the optics have a sensor of their own; and as :func:`simulate_raw` and the optics do.
+        ValueError: if the optics have a sensor; and as :func:`simulate_raw` and the optics do.
 
     Example:
         >>> from kornia_tidy import TiDyOptics

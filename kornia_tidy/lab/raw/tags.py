@@ -203,7 +203,7 @@ def _time(text: str | None) -> str | None:
 
 
 def _ciff_names(data: bytes) -> tuple[str | None, str | None]:
-    """Return make and model from the heaps of Canon's CRW, each of which ends with the offset of its record list."""
+    """Return make and model from the heaps of Canon's CRW, which end with the offsets of their record lists."""
     waiting = [((_unpack(data, "<I", 2) or (0,))[0], len(data))]
     for _ in range(MOST_DIRECTORIES):
         if not waiting:

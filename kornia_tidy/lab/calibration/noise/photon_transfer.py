@@ -106,7 +106,7 @@ class PhotonTransfer:
         return (least / self.line.gain) ** 2 + ROUNDING >= RESOLVED
 
     def check_taken_alike(self, raw: RawCapture, name: str) -> None:
-        """Raise ``ValueError`` if a capture was taken by another camera or at another gain, as far as it is known.
+        """Raise ``ValueError`` if a capture was taken by another camera or at another known gain.
 
         Args:
             raw: the capture.
@@ -281,7 +281,7 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         path: file to read.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is not a calibration of this format.
     """
     data = read_bytes(path)

@@ -97,7 +97,7 @@ def spatial_points(raw: RawCapture, black: Tensor | None = None) -> list[CurvePo
 
 
 def tile_of(raw: RawCapture) -> tuple[int, int]:
-    """Return the rows and columns of the tile by which a capture is split into planes: the filter array's, else 2x2."""
+    """Return the rows and columns of the tile that splits a capture into planes: the filter array's, else 2x2."""
     return (2, 2) if raw.pattern is None else raw.tile
 
 

@@ -18,7 +18,7 @@ LEAST_CHANCE = 1e-3  # that brightest values are alike without being clipped
 
 
 def check_diameter(diameter: float, distances: Sequence[float], camera: ThinLensCamera) -> None:
-    """Refuse a point of light whose image is not small.
+    """Refuse a point of light with a large image.
 
     Raises:
         ValueError: if the diameter is negative or not a number, or the image is wider than half a pixel.
@@ -53,7 +53,7 @@ def check_clipping(images: Mapping[float, Sequence[PointImage]]) -> None:
 
     .. math:: p = (1 - e^{-d \sqrt{2 \ln N} / \sigma})^{k - 1}
 
-    or less, as the point's place between the pixels makes them differ too.
+    or less, as the point's place between the pixels also makes them differ.
 
     Raises:
         ValueError: if at one distance the chance is below one in a thousand that so many brightest values are alike.
@@ -96,7 +96,7 @@ def warn_of_still_point(images: Mapping[float, Sequence[PointImage]]) -> None:
 
 
 def warn_of_light_around(shares: Mapping[float, float], window: int) -> None:
-    """Warn of light beyond the window, of which an unknown part was subtracted with the background.
+    """Warn of light beyond the window, since an unknown part of it was subtracted with the background.
 
     Args:
         shares: for each distance, the share of the light between the window and the circle of radius P.

@@ -23,7 +23,7 @@ def measured_camera(psfs: MeasuredPSFs | str | os.PathLike[str], **options: Any)
         are seen as the end of the range. Between two distances PSFs are mixed linearly.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file holds no measured PSFs, or the lens is unknown.
 
     Example:

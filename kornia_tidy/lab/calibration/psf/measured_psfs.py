@@ -135,7 +135,7 @@ class MeasuredPSFs:
             device: device of the tensors.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if the file is not a PSF bank, or a bank that was not measured.
         """
         bank = PSFBank.load(path, device)
@@ -150,7 +150,7 @@ class MeasuredPSFs:
             raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
 
     def in_words(self) -> list[tuple[str, str]]:
-        """Return what was left out, and the accuracy at each distance, as topics and texts."""
+        """Return the omitted captures, and the accuracy at each distance, as topics and texts."""
         topics = [
             ("left out", f"the point at {r.distance:g} m, row {r.row:.1f}, column {r.column:.1f}: {r.rejected}")
             for r in self.reports
@@ -197,7 +197,7 @@ def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil |
     Args:
         camera: lens with aperture radius R, image distance s' and pixel pitch p.
         wavelength: shortest wavelength of the channel in metres.
-        pupil: aperture whose diameter d is the largest distance between two open points, in pupil radii. Default: that
+        pupil: aperture of diameter d, the largest distance between two open points, in pupil radii. Default: that
             of 23x23 mask pixels. Its corner pixels reach beyond the disc, so d is 2.14, and 2 for the disc.
 
     Source: Goodman, Introduction to Fourier Optics, section 7.2.
@@ -298,7 +298,7 @@ def measure_psfs(
         shares[distance] = share_around(float(raw.around.max()), window)
         psf, remaining = shrink(raw.psf, raw.variance)
         psfs.append(psf.clamp(min=0))
-        # An error of the total, by which all values are divided, changes them in proportion.
+        # An error of the total, the divisor of all values, changes them in proportion.
         remaining = remaining * (1 - 2 * psf).clamp(min=0) + psf.square() * raw.variance.sum((1, 2), keepdim=True)
         common = raw.common - psf[:, None] * raw.common.sum((2, 3), keepdim=True)
         deviations.append((remaining + common.square().sum(1)).sqrt())
@@ -338,7 +338,7 @@ def _raw(images: Sequence[PointImage], found: Registered, window: int, blur: flo
     used = [image for image, good in zip(images, found.used.tolist(), strict=True) if good]
     scale = found.brightness[found.used]
     told = torch.tensor([image.offset for image in used], dtype=torch.float64)
-    # The mean position is that of the centres of light, whose scatter about the registered positions tells its error.
+    # The mean position is that of the centres of light; their scatter about the registered positions gives its error.
     spread = (told - found.offsets[found.used]).var(0, correction=min(1, len(used) - 1))
     position = (spread / len(used)).sqrt()
     count = len(images[0].light)

@@ -140,7 +140,7 @@ def retrieve_mask(
 ) -> MaskFit:
     r"""Retrieve an unknown single mask from measured PSFs.
 
-    First each channel is fitted alone, which gives the phase up to whole waves of its wavelength. Then
+    First each channel is fitted by itself, which gives the phase up to whole waves of its wavelength. Then
     :func:`one_height` combines these phases to one height, and a fit of all channels follows. A fit of all channels
     from the start would have local minima at heights wrong by one wave, since a wave of green is not a wave of red.
 
@@ -271,7 +271,7 @@ class _Model:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Move the defocus offset to the nodes, where it is exact, if it is no longer small."""
+        """Move the defocus offset to the nodes, where it is exact, if it is not a longer small."""
         if abs(float(self.offset)) > 0.25:
             self.centre += float(self.offset)
             self.offset.zero_()

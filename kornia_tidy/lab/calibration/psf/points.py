@@ -105,7 +105,7 @@ def annulus_background(image: Tensor, centre: tuple[float, float], inner: float,
 
 
 def light_around(image: Tensor, centre: tuple[int, int], window: int) -> Tensor:
-    """Return the mean light (C,) between a window and the circle whose radius is the window's side.
+    """Return the mean light (C,) between a window and the circle with the window's side as its radius.
 
     Args:
         image: (C, H, W), background subtracted.
