@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -12,11 +12,13 @@ from kornia.color import rgb_to_linear_rgb
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part, described, unmasked
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
@@ -46,6 +48,8 @@ def simulate(
     color: Color = "bgr",
     seed: int | None = None,
     holes: str = "error",
+    lens: Lens | str | None = None,
+    field_center: Any = None,
 ) -> NDArray[Any]:
     """Simulate the coded capture of arrays, such as OpenCV reads.
 
@@ -61,6 +65,9 @@ def simulate(
         seed: of the sensor's noise. Default: drawn from torch's global generator.
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
             does; ``"error"`` leaves them to the camera. Where they were, ``fill_holes(depth)`` says.
+        lens: a real lens in front of the default masks, or its name; ``optics`` has its own.
+        field_center: where the middle of the picture lies from the lens's axis, y and x in sensor pixels: (2,), or
+            (B, 2).
 
     Returns:
         The capture, in the layout, data type and colour order of the image; integers are rounded.
@@ -80,8 +87,7 @@ def simulate(
         >>> capture.shape, capture.dtype
         ((32, 48, 3), dtype('uint8'))
     """
-    optics = _default_optics() if optics is None else optics
-    check_part("optics", optics, TiDyOptics, "a TiDyOptics")
+    optics = lens_optics(optics, lens, _default_optics)
     check_choice("holes", holes, HOLES)
     pixels = to_tensor(unmasked("image", image), color, light=optics.color_space == "linear")
     metres = depth_to_tensor(depth, depth_scale)
@@ -91,7 +97,7 @@ def simulate(
         metres, _ = fill_holes(metres)
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        coded = optics(pixels, metres, generator=generator)
+        coded = optics(pixels, metres, generator=generator, field_center=field_center)
     return to_array(coded, image.dtype, color, image.ndim)
 
 
@@ -226,9 +232,9 @@ def to_array(images: Tensor, dtype: np.dtype[Any], color: Color, ndim: int) -> N
     return array if ndim == 4 else array[0, ..., 0] if ndim == 2 else array[0]
 
 
-@cache
-def _default_optics() -> TiDyOptics:
-    return TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
+@lru_cache(maxsize=4)
+def _default_optics(lens: Lens | str | None) -> TiDyOptics:
+    return TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)), **lens_parts(lens))
 
 
 def _light_head(system: Any) -> LightHead:

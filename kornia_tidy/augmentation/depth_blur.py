@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from kornia.augmentation.random_generator import PlainUniformGenerator
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
+from kornia_tidy.augmentation.lens_argument import lens_parts
 from kornia_tidy.augmentation.ranges import Range, checked_range
+from kornia_tidy.augmentation.rows import row_places
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.render.compositing import render
 
 SPACING = 0.5  # pixels of radius between two discs; between them the discs are blended
@@ -222,6 +228,8 @@ class RandomDepthBlur(DepthAugmentation):
         keepdim: return (C, H, W) for (C, H, W).
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
             does; ``"error"`` refuses them.
+        lens: a real lens instead, or its name: PSFs with aberrations and diffraction, which vary over the picture, at
+            the lens's own focus and f-number. Each image is a crop from a place that is drawn over its field.
 
     Shape:
         - As :class:`~kornia_tidy.augmentation.DepthAugmentation`.
@@ -252,6 +260,7 @@ class RandomDepthBlur(DepthAugmentation):
         p: float = 0.5,
         keepdim: bool = False,
         holes: str = "error",
+        lens: Lens | str | None = None,
     ) -> None:
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
         nearest, farthest = checked_range("focus_distance", focus_distance, "metres")
@@ -274,7 +283,32 @@ class RandomDepthBlur(DepthAugmentation):
             "compositing": compositing,
             "color_space": color_space,
         }
+        own = (nearest, farthest), tuple(ends.tolist()), focal_length, max_radius
+        self.optics = None if lens is None else _lens_camera(lens, pixel_pitch, compositing, color_space, own)
+
+    def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:
+        """Return the draws of a batch: focus and f-number, or behind a real lens the places in its field."""
+        if self.optics is None:
+            return super().generate_parameters(batch_shape)
+        return {"field_center": row_places(batch_shape, self.optics, self.same_on_batch)}
 
     def change(self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor]) -> Tensor:
         """Return blurred images. See :meth:`DepthAugmentation.change`."""
+        if self.optics is not None:
+            return self.optics(image, depth, field_center=params["field_center"])
         return depth_blur(image, depth, params["focus_distance"], params["f_number"], **self.flags)
+
+
+_DISCS = {"focus_distance": (0.5, 5.0), "f_number": (2.0, 16.0), "focal_length": 50e-3, "max_radius": 16.0}
+_CELLS = 23  # of a pupil without masks that a lens's own stop cuts
+
+
+def _lens_camera(
+    lens: Lens | str, pixel_pitch: float, compositing: str, color_space: str, given: Sequence[Any]
+) -> TiDyOptics:
+    """Return a camera without masks and noise behind a real lens; refuse what discs alone have."""
+    for (name, usual), value in zip(_DISCS.items(), given, strict=True):
+        if value != usual:
+            raise ValueError(f"a real lens has a focus, an f-number and blur of its own: leave {name} out, got {value}")
+    settings = {"compositing": compositing, "color_space": color_space, "border": "replicate", "sensor": None}
+    return TiDyOptics(NoMask(_CELLS), **lens_parts(lens, pixel_pitch), **settings)

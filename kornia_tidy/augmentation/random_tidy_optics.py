@@ -13,10 +13,11 @@ from torch import Tensor
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.drawn_camera import DrawnOptics, RowSensors, drawn_camera, sensor_with
+from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
 from kornia_tidy.augmentation.ranges import Range, checked_range
 from kornia_tidy.augmentation.rows import row_places, row_seeds
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_part
+from kornia_tidy.optics.lens.lens import Lens
 
 _OF_OPTICS = ("focus_distance", "aperture_diameter", "mask_jitter", "switching_time")
 
@@ -37,6 +38,7 @@ class RandomTiDyOptics(DepthAugmentation):
         keepdim: return (C, H, W) for (C, H, W).
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
             does; ``"error"`` leaves them to the camera.
+        lens: a real lens of the default camera, or its name; ``optics`` has its own.
 
     Shape:
         - ``augmentation(image, depth)``: (B, C, H, W) and (B, 1, H, W) or (1, 1, H, W), or both without B, to the
@@ -88,10 +90,10 @@ class RandomTiDyOptics(DepthAugmentation):
         p: float = 0.5,
         keepdim: bool = False,
         holes: str = "error",
+        lens: Lens | str | None = None,
     ) -> None:
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
-        self.optics = TiDyOptics() if optics is None else optics
-        check_part("optics", self.optics, TiDyOptics, "a camera such as TiDyOptics()")
+        self.optics = lens_optics(optics, lens, lambda lens: TiDyOptics(**lens_parts(lens)))
         if self.optics.border == "valid":
             raise ValueError(
                 "border 'valid' gives smaller images, and an augmentation keeps their size: use another border"
@@ -126,8 +128,7 @@ class RandomTiDyOptics(DepthAugmentation):
         params = super().generate_parameters(batch_shape)
         params["seed"] = row_seeds(batch_shape[0], self.same_on_batch)
         if self.optics.lens is not None and self.optics.field_center == (0.0, 0.0):
-            reach = self.optics.lens.field / float(self.optics.camera.pixel_pitch)
-            params["field_center"] = row_places(batch_shape, reach, self.same_on_batch)
+            params["field_center"] = row_places(batch_shape, self.optics, self.same_on_batch)
         return params
 
     def change(self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor]) -> Tensor:

@@ -105,23 +105,24 @@ def row_seeds(count: int, same: bool) -> Tensor:
     return torch.randint(_SEEDS, (1 if same else count,)).expand(count).clone()
 
 
-def row_places(shape: tuple[int, ...], reach: float, same: bool) -> Tensor:
-    """Draw where each image of a batch lies in the field of a lens, from the global generator.
+def row_places(shape: tuple[int, ...], optics: Any, same: bool) -> Tensor:
+    """Draw where each image of a batch lies in the field of a camera's lens, from the global generator.
 
     Args:
         shape: of the batch, (B, C, H, W).
-        reach: largest distance from the axis in pixels, which no corner exceeds.
+        optics: a :class:`~kornia_tidy.TiDyOptics` with a lens, whose field no corner exceeds.
         same: one place for all of them.
 
     Returns:
         (B, 2) float64, y and x of the middle in pixels from the axis, evenly over a disc.
 
     Example:
-        >>> places = row_places((100, 3, 60, 80), 150.0, same=False)
-        >>> bool((places.norm(dim=1) <= 100).all())
+        >>> from kornia_tidy import NoMask, TiDyOptics
+        >>> places = row_places((100, 3, 60, 80), TiDyOptics(NoMask(23), lens="single-50mm"), same=False)
+        >>> bool((places.norm(dim=1) <= 6.784e-3 / 8e-6 - 50).all())
         True
     """
-    free = max(0.0, reach - math.hypot(*shape[-2:]) / 2)
+    free = max(0.0, optics.lens.field / float(optics.camera.pixel_pitch) - math.hypot(*shape[-2:]) / 2)
     radius, angle = torch.rand(2, 1 if same else shape[0], dtype=torch.float64)
     places = free * radius.sqrt() * torch.stack([torch.sin(2 * math.pi * angle), torch.cos(2 * math.pi * angle)])
     return places.T.expand(shape[0], 2).clone()

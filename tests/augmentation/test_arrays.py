@@ -127,7 +127,7 @@ class TestSimulate(BaseTester):
             ({"depth": np.ones((4, 5, 2, 2))}, ValueError, r"depth must have shape .*, got \(4, 5, 2, 2\)"),
             ({"depth_scale": 0.0}, ValueError, "depth_scale must be positive"),
             ({"color": "BGR"}, ValueError, "color must be one of 'bgr', 'rgb', got 'BGR'"),
-            ({"optics": "tidy-5"}, TypeError, "optics must be a TiDyOptics, got 'tidy-5'"),
+            ({"optics": "tidy-5"}, TypeError, "optics must be a camera such as TiDyOptics.., got 'tidy-5'"),
         ],
     )
     def test_exception(self, change, error, sentence):
@@ -216,3 +216,17 @@ class TestConversion(BaseTester):
         assert {"simulate", "reconstruct"} <= set(kornia_tidy.__all__)
         with pytest.raises(AttributeError, match="has no attribute 'simulat'"):
             _ = kornia_tidy.simulat
+
+
+class TestBehindALens(BaseTester):
+    def test_feature_arrays_are_taken_through_a_lens_at_their_place(self):
+        image = np.random.default_rng(0).random((40, 36, 3), np.float32)
+        depth = np.full((40, 36), 0.8, np.float32)
+        seen = kornia_tidy.simulate(image, depth, lens="single-50mm", field_center=(200.0, -100.0), color="rgb", seed=1)
+        masks = PixelwiseMask(5, generator=torch.Generator().manual_seed(0))
+        optics = TiDyOptics(masks, lens="single-50mm", field_center=(200.0, -100.0))
+        pixels, metres = torch.from_numpy(image).movedim(-1, 0), torch.from_numpy(depth)[None]
+        expected = optics(pixels, metres, generator=torch.Generator().manual_seed(1)).detach()
+        self.assert_close(torch.from_numpy(seen).movedim(-1, 0), expected, rtol=0, atol=1e-4)
+        with pytest.raises(ValueError, match="optics has a lens of its own"):
+            kornia_tidy.simulate(image, depth, optics=TiDyOptics(), lens="single-50mm")

@@ -6,8 +6,10 @@ import pytest
 import torch
 from scipy.ndimage import convolve
 
+from kornia_tidy import NoMask, TiDyOptics
 from kornia_tidy.augmentation import DepthBlur, RandomDepthBlur, depth_blur
 from kornia_tidy.augmentation.depth_blur import blur_radius, disc
+from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import scene
 
@@ -164,3 +166,36 @@ class TestRandomDepthBlur(BaseTester):
         params = augmentation.forward_parameters(image.shape)
         compiled = torch.compile(augmentation, backend="eager")
         self.assert_close(compiled(image, depth, params=params), augmentation(image, depth, params=params))
+
+
+class TestBehindALens(BaseTester):
+    @torch.no_grad()
+    def test_feature_places_are_drawn_and_blur_by_the_lens(self):
+        lens = Lens.named("single-50mm", 17.6, 0.595)
+        augmentation = RandomDepthBlur(lens=lens, p=1.0, color_space="linear")
+        image, depth = torch.rand(2, 1, 24, 24), torch.full((2, 1, 24, 24), 0.5)
+        torch.manual_seed(1)
+        blurred = augmentation(image, depth)
+        places = augmentation._params["field_center"]
+        assert places.shape == (2, 2)
+        assert not torch.equal(places[0], places[1])
+        settings = {"sensor": None, "color_space": "linear", "border": "replicate"}
+        bare = TiDyOptics(NoMask(23), lens.camera(8e-6), lens=lens, **settings)
+        for i in range(2):
+            expected = bare(image[i], depth[i], field_center=places[i])
+            self.assert_close(blurred[i], expected, rtol=0, atol=1e-5)
+        assert torch.equal(augmentation(image, depth, params=augmentation._params), blurred)
+        assert float((blurred - image).abs().max()) > 0.05
+
+    @pytest.mark.parametrize(
+        ("options", "error", "message"),
+        [
+            ({"lens": "single-50mm", "f_number": (4, 8)}, ValueError, "leave f_number out, got \\(4.0, 8.0\\)"),
+            ({"lens": "single-50mm", "max_radius": 8}, ValueError, "leave max_radius out, got 8"),
+            ({"lens": 5}, TypeError, "lens must be a Lens or the name of one"),
+            ({"lens": "single"}, ValueError, "name of a lens must be one of"),
+        ],
+    )
+    def test_exception_a_lens_has_its_own(self, options, error, message):
+        with pytest.raises(error, match=message):
+            RandomDepthBlur(**options)

@@ -271,3 +271,10 @@ class TestBehindALens(BaseTester):
         augmentation = RandomTiDyOptics(self.augmentation().optics, p=1.0, same_on_batch=True)
         drawn = augmentation.forward_parameters((3, 3, 40, 40))["field_center"]
         assert torch.equal(drawn, drawn[:1].expand(3, 2))
+
+    def test_feature_the_default_camera_takes_a_lens(self):
+        augmentation = RandomTiDyOptics(lens="double-gauss-50mm")
+        assert augmentation.optics.lens.name == "double-gauss-50mm"
+        assert augmentation.optics.camera.focal_length == augmentation.optics.lens.focal_length
+        with pytest.raises(ValueError, match="optics has a lens of its own: give lens to TiDyOptics"):
+            RandomTiDyOptics(TiDyOptics(), lens="double-gauss-50mm")

@@ -162,7 +162,7 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
         with stages("PSFs"):
             optics = self.optics.optics(scene, sensor=None, fidelity=self.fidelity, compositing=self.compositing)
             bank = optics.psf_bank(channels=3 if camera.colors else 1)
-        tell("lens", optics.camera.extra_repr())
+        tell("lens", (optics.camera if optics.lens is None else optics.lens).extra_repr())
         tell("masks", self.optics.in_words(optics))
         tell("PSFs", light_in_words(bank, optics))
         with stages("capture"):

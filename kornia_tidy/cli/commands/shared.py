@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from kornia_tidy.cli.commands.lens_option import RealLens, camera_and_lens
 from kornia_tidy.reconstruction.settings import LensSettings
 from kornia_tidy.settings import Electrons, Metres, Seed, Unit, one_of
 
@@ -145,9 +146,22 @@ class SceneLens(LensSettings):
 
     Args:
         fit_depth: choose focus and aperture so that this scene's depths (its middle 99 %) fill psi = -20 to +20.
+        lens: a real lens, whose PSFs vary over the picture, by its name; a file that Lens.save wrote; or its surfaces
+            (.zmx, .seq, .json). None: an ideal lens.
     """
 
     fit_depth: bool = False
+    lens: RealLens | None = None
+
+    def optics_for(self, scene: Scene | None) -> dict[str, Any]:
+        """Return camera and lens, as :class:`~kornia_tidy.TiDyOptics` takes them.
+
+        Raises:
+            ValueError: if two options say the same, or no lens fits.
+        """
+        size = None if scene is None else (scene.depth.shape[-2], scene.depth.shape[-1])
+        camera, lens = camera_and_lens(self.lens, self, lambda own: own.camera_for(scene), size)
+        return {"camera": camera} if lens is None else {"camera": camera, "lens": lens}
 
     def camera_for(self, scene: Scene | None) -> ThinLensCamera:
         """Return the camera, or the one that fits the scene.
@@ -216,7 +230,7 @@ class CameraSettings:
         else:
             generator = torch.Generator().manual_seed(self.mask_seed or 0)
             shown = PixelwiseMask(MASKS if self.masks is None else self.masks, generator=generator)
-        return TiDyOptics(shown, camera=self.lens.camera_for(scene), **options)
+        return TiDyOptics(shown, **self.lens.optics_for(scene), **options)
 
     def in_words(self, optics: TiDyOptics) -> str:
         """Describe the masks of the camera."""

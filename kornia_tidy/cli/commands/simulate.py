@@ -62,6 +62,10 @@ class Simulate:
     kornia-tidy simulate im0.png --depth disp0.pfm --depth-kind disparity \\
         --invalid inf --focal-px 999.421 --baseline-m 0.193001 --doffs-px 32.778 \\
         --holes fill --fit-depth
+
+  Through a real lens, from a file of an optical program:
+    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --lens lens.zmx \\
+        --f-number 8 --focus-distance 1.5
 """
     notes: ClassVar = """\
 The first example in Python, the same but for the rounding to 8 bits:
@@ -86,7 +90,16 @@ The first example in Python, the same but for the rounding to 8 bits:
             "mask_seed",
             "psfs",
         ),
-        *("focal_length", "f_number", "focus_distance", "depth_range", "pixel_pitch", "fit_depth", "depth_scale"),
+        *(
+            "focal_length",
+            "f_number",
+            "focus_distance",
+            "depth_range",
+            "pixel_pitch",
+            "fit_depth",
+            "lens",
+            "depth_scale",
+        ),
     )
 
     def run(self) -> None:
@@ -122,6 +135,8 @@ The first example in Python, the same but for the rounding to 8 bits:
                 )
                 bank = optics.psf_bank(channels=scene.image.shape[0])
             tell("camera", optics.camera.extra_repr())
+            if optics.lens is not None:
+                tell("lens", optics.lens.extra_repr())
             tell("masks", self.camera.in_words(optics))
             tell("PSFs", light_in_words(bank, optics))
             tell(

@@ -102,6 +102,8 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
 
         tell("scene", f"{name}, {scene_in_words(scene)}")
         tell("camera", optics.camera.extra_repr())
+        if optics.lens is not None:
+            tell("lens", optics.lens.extra_repr())
         tell("masks", self.camera.in_words(optics))
         tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
         todo = len(missing(settings, known, self.repeats, self.training))

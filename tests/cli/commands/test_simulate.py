@@ -17,7 +17,10 @@ from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.rgbd import read_rgbd
+from kornia_tidy.optics import Lens
+from kornia_tidy.optics.lens import NAMED_LENSES
 from tests.base import BaseTester, shared
+from tests.optics.lens.written_files import zemax
 
 
 def seeded(seed):
@@ -57,6 +60,39 @@ class TestSimulate(BaseTester):
         coded = TiDyOptics(masks)(image, depth, generator=seeded(0)).detach()
         assert float((read_image("out.png") - coded).abs().max()) <= 0.5 / 255 + 1e-6
         assert float((image - coded).abs().mean()) > 0.05  # it did something
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.filterwarnings("ignore:.*beyond the camera's range:UserWarning")
+    @pytest.mark.parametrize("lens", ["single-50mm", "own.safetensors", "lens.zmx"])
+    def test_feature_a_real_lens_by_name_table_or_surfaces(self, scene, lens, capsys):
+        single = NAMED_LENSES["single-50mm"]["prescription"]
+        (scene / "lens.zmx").write_text(zemax(single))
+        made = Lens.named("single-50mm", 12.0, 0.7, field=1e-3)
+        made.save(scene / "own.safetensors")
+        words = [] if lens == "own.safetensors" else ["--f-number", "12", "--focus-distance", "0.7"]
+        options = ["--lens", lens, *words, "--fidelity", "draft", "-o", "out.png"]
+        assert main(["simulate", "image.png", "--depth", "depth.pfm", *options]) == 0
+        image, depth, _ = read_rgbd("image.png", "depth.pfm")
+        optics = TiDyOptics(PixelwiseMask(5, generator=seeded(0)), made.camera(8e-6), lens=made, fidelity="draft")
+        coded = optics(image, depth, generator=seeded(0)).detach()
+        assert float((read_image("out.png") - coded).abs().max()) <= 1.5 / 255
+        assert "50 mm f/12, focus at 0.7 m" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (["--lens", "single-50mm", "--focal-length", "0.04"], "has its own: leave out --focal-length"),
+            (["--lens", "lens"], "--lens must be one of 'double-gauss-50mm'"),
+            (["--lens", "own.safetensors", "--fit-depth"], "own.safetensors has its own: leave out --fit-depth"),
+            (["--lens", "single-50mm", "--psfs", "bank"], "leave out --lens"),
+        ],
+    )
+    def test_exception_of_a_lens(self, scene, words, sentence, capsys):
+        (scene / "own.safetensors").write_bytes(b"no lens")
+        assert main(["simulate", "image.png", "--depth", "depth.pfm", *words]) == 2
+        error = capsys.readouterr().err
+        assert sentence in error
+        assert error.count("\n") == 1
 
     @pytest.mark.filterwarnings("ignore:.*beyond the camera's range:UserWarning")
     def test_feature_a_scene_all_beyond_the_range_is_told_in_plain_numbers(self, scene, capsys):
