@@ -1,4 +1,4 @@
-"""A network for the captures of any camera: it corrects the closed form as far as it is sure."""
+"""A network for the captures of any camera: it corrects the closed form in proportion to its certainty."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class AnyCameraHead(ClosedFormHead):
 
     .. math:: \hat x = x_0 + \sigma(s) \, \Delta
 
-    The network estimates the correction :math:`\Delta`, and for each pixel the logit s of its share. It is told what is
-    known of the camera: the maps of :class:`~kornia_tidy.reconstruction.ruled_closed_form.RuledClosedForm`. So one
+    The network estimates the correction :math:`\Delta`, and for each pixel the logit s of its share. Its inputs
+    describe the camera: the maps of :class:`~kornia_tidy.reconstruction.ruled_closed_form.RuledClosedForm`. So one
     network serves all cameras: PSFs and noise are set, not learnt.
 
     Args:
         width: of the :class:`~kornia_tidy.reconstruction.NAFNet`.
         repeats: of its blocks.
-        layers: number of depths whose deconvolutions the network sees.
+        layers: number of depths with a deconvolution among the inputs.
         encoded: captures are encoded as sRGB. False: they are linear light.
 
     Shape:

@@ -34,18 +34,18 @@ class MonocularDepth(ReconstructionHead):
 
     .. math:: n = a d + b.
 
-    A relative network (Depth Anything V2) leaves a and b unknown. They are an affine fit to depths that are known,
-    either of other scenes (:meth:`fit`) or, as papers score such networks, of the scored picture itself
-    (:func:`fit_affine`): the second one has seen the truth, and a report must say so. A metric network (ZoeDepth)
-    gives metres, so that the camera alone determines both (:meth:`for_camera`).
+    A relative network (Depth Anything V2) leaves a and b unknown. They are an affine fit to known depths, either of
+    other scenes (:meth:`fit`) or, as papers score such networks, of the scored picture itself (:func:`fit_affine`): the
+    second one uses the true depths, and a report must state this. A metric network (ZoeDepth) gives metres, so that the
+    camera alone determines both (:meth:`for_camera`).
 
     Args:
         network: takes ``pixel_values`` and returns ``predicted_depth`` (B, h, w): inverse depth up to scale and shift,
             or metres.
         metric: whether it returns metres.
-        side: pixels to which the shorter side of a picture is resized; the ratio of the sides is kept.
+        side: length of a picture's shorter side after resizing, in pixels; the ratio of the sides is kept.
         multiple: both sides are rounded to multiples of this number of pixels, the network's patches.
-        mean: of red, green and blue, by which a picture is normalised.
+        mean: of red, green and blue, for normalising a picture.
         deviation: of red, green and blue.
 
     Shape:
@@ -121,7 +121,7 @@ class MonocularDepth(ReconstructionHead):
         """Set scale and shift of a metric network from a camera: defocus is affine in inverse depth.
 
         Raises:
-            TypeError: if the camera is no :class:`~kornia_tidy.ThinLensCamera`.
+            TypeError: if the camera is not a :class:`~kornia_tidy.ThinLensCamera`.
             ValueError: if the network is not metric.
         """
         check_part("camera", camera, ThinLensCamera, "a ThinLensCamera, which has a metric scale")
@@ -155,7 +155,7 @@ def fit_affine(estimate: Tensor, truth: Tensor, valid: Tensor | None = None) -> 
 
     .. math:: \min_{a, b} \sum_{valid} (a e + b - t)^2
 
-    An estimate that is fitted to the truth of its own image has seen it. Say so beside every score.
+    An estimate fitted to its image's true depth uses this depth. State this beside every score.
 
     Args:
         estimate: (B, 1, H, W).
@@ -189,7 +189,7 @@ def depth_anything_v2(in_channels: int = 3, out_channels: int = 1, width: int = 
 
     Args:
         in_channels: 3.
-        out_channels: 1: it estimates depth alone.
+        out_channels: 1: it estimates only depth.
         width: channels of its transformer, a multiple of 8: 384 is Small, 768 Base and 1024 Large; others are small
             networks of four layers.
 
@@ -225,7 +225,7 @@ def zoedepth(in_channels: int = 3, out_channels: int = 1, width: int = 1024) -> 
 
     Args:
         in_channels: 3.
-        out_channels: 1: it estimates depth alone.
+        out_channels: 1: it estimates only depth.
         width: channels of its transformer, a multiple of 8: 1024 is the published size; others are small networks of
             four layers.
 
@@ -270,7 +270,7 @@ def load_depth_anything_v2(name_or_folder: str | os.PathLike[str], **options: An
     Raises:
         ImportError: if transformers is missing.
         ValueError: if weights are missing from the files.
-        OSError: if there is no such folder or repository.
+        OSError: if the folder is missing or repository.
     """
     return _depth_anything(_load("DepthAnythingForDepthEstimation", name_or_folder, options)).eval()
 
@@ -288,7 +288,7 @@ def load_zoedepth(name_or_folder: str | os.PathLike[str], **options: Any) -> Mon
     Raises:
         ImportError: if transformers is missing.
         ValueError: if weights are missing from the files.
-        OSError: if there is no such folder or repository.
+        OSError: if the folder is missing or repository.
     """
     return _zoedepth(_load("ZoeDepthForDepthEstimation", name_or_folder, options)).eval()
 

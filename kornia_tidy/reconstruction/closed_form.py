@@ -107,7 +107,7 @@ class ClosedForm(nn.Module):
     .. math:: \hat x = \sum_k p_k \, (k_k * y), \quad p \propto e^{l / T}, \quad T = 0.5 \max(\sigma / 0.002, 1)
 
     Args:
-        layers: number D of depths for each of which the brightness is deconvolved too, with a weight of 0.01 and the
+        layers: number D of depths with a deconvolution of the brightness for each, with a weight of 0.01 and the
             mean PSF of the colours, as further inputs of a network: where PSFs differ between depths, the map of its
             own depth restores a region best.
         bilateral: False leaves out the bilateral filter.
@@ -228,10 +228,10 @@ class ClosedForm(nn.Module):
             self.whitening, self.log_determinants = likelihood_filters(wide.mean(1)[..., middle, middle])
 
     def set_noise(self, sensor: nn.Module) -> None:
-        """Take the noise of a sensor, by which captures are restored if no noise is given with them.
+        """Take the noise of a sensor as the default for captures without a given noise.
 
         Raises:
-            TypeError: if the sensor has no ``std``, and so cannot say what noise it makes.
+            TypeError: if the sensor has no ``std`` to describe its noise.
         """
         deviation = getattr(sensor, "std", None)
         if not callable(deviation):

@@ -48,7 +48,7 @@ class ClosedFormHead(ReconstructionHead):
           :func:`kornia_tidy.reconstruction.trained.update_psfs`. They are part of the state.
         - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the deconvolution.
 
-    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes a closed form. He et
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), for a network behind a closed form. He et
     al., Deep Residual Learning (CVPR 2016); Zhang, Zuo and Zhang, FFDNet (TIP 2018), for the map of the noise.
 
     Example:
@@ -113,7 +113,7 @@ def with_fine_maps(weights: Mapping[str, Tensor], head: ClosedFormHead) -> dict[
         head: with them; it is not changed.
 
     Returns:
-        A state for ``head``; weights of another kind of network stay as they are.
+        A state for ``head``; weights of another kind of network are unchanged.
 
     Raises:
         ValueError: if the first convolution takes another number of maps.

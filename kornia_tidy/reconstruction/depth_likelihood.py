@@ -15,7 +15,7 @@ from kornia_tidy.reconstruction.truncation import SIDE, plane_of, truncated
 from kornia_tidy.render.borders import pad_border
 
 CONTRASTS = (0.02, 0.06, 0.2)  # standard deviations of the light of a scene, of full scale
-NOISE = 4e-3  # standard deviation of what the model leaves out, of full scale: sensor noise, depth edges
+NOISE = 4e-3  # standard deviation of the model's error, of full scale: sensor noise, depth edges
 EXPONENT, KNEE = 2.9, 1 / 256  # of the power spectrum of real scenes in linear light: f^-2.9 above 1/256 cycles a pixel
 # Its integral over the circle of half a cycle a pixel; over a plane of a few PSFs it would not be resolved.
 VARIANCE = math.pi / (EXPONENT / 2 - 1) * (KNEE ** (2 - EXPONENT) - (0.25 + KNEE**2) ** (1 - EXPONENT / 2))
@@ -66,7 +66,7 @@ def depth_likelihood(light: Tensor, filters: Tensor, log_determinants: Tensor) -
     .. math:: \log p_k(x) = \log \sum_a \exp \Big( -\frac{N}{2}
                 \big[ ( (g_{ak} * y)^2 * w )(x) + \ell_{ak} \big] \Big)
 
-    It is that of a Gaussian scene of unknown contrast, whose patch w of N samples is at one depth. On a blank wall all
+    It is that of a Gaussian scene of unknown contrast; the patch w of N samples is at one depth. On a blank wall all
     depths are about equally likely. Squares are limited to 25.
 
     Args:

@@ -1,4 +1,4 @@
-"""Freed memory that the C library keeps for itself, given back to the system."""
+"""Return of freed memory from the C library to the system."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def linear_fit(probability: Tensor, guide: Tensor) -> tuple[list[Tensor], Tensor
 
 
 def _windows(maps: Tensor) -> Tensor:
-    """Return the means of square windows; at the border of those pixels that are there."""
+    """Return the means of square windows; at the border of the pixels inside the image."""
     side = 2 * RADIUS + 1
     rows = functional.avg_pool2d(maps, (1, side), 1, (0, RADIUS), count_include_pad=False)
     return functional.avg_pool2d(rows, (side, 1), 1, (RADIUS, 0), count_include_pad=False)

@@ -11,8 +11,8 @@ from torch import Tensor
 def halved(weights: Mapping[str, Tensor], names: Collection[str]) -> dict[str, Tensor]:
     r"""Return weights in which some are float16, with a relative error of at most :math:`2^{-11}`.
 
-    Weights below 6e-5 have an absolute error of at most 3e-8 instead. Those that are float16 already, or no floating
-    point, stay as they are.
+    Weights below 6e-5 have an absolute error of at most 3e-8 instead. Tensors of float16 or without floating point are
+    unchanged.
 
     Args:
         weights: by name.

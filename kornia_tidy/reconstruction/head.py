@@ -34,7 +34,7 @@ class ReconstructionHead(nn.Module, ABC):
 
     Convention:
         - Captures are in [0, 1]. If the first image is in 0..255 or normalised, a warning is given.
-        - An image whose sides are no multiples of ``stride`` is padded equally on both sides, and the result is
+        - An image with other sides than multiples of ``stride`` is padded equally on both sides, and the result is
           cropped. The padding is by reflection, which adds no edges; if a side is too short for that, by replication.
         - An ONNX export is for the image size it was made with; the batch size may be dynamic.
     """

@@ -43,7 +43,7 @@ my_package.networks:Network, got 'nafnett'
 
 
 def check_imported(name: str) -> None:
-    """Raise ``ValueError`` for a head by import path whose module is not imported yet.
+    """Raise ``ValueError`` for a head by import path from a module that is not imported yet.
 
     To import a module runs its code, and which one it is may not be for a file to say.
 

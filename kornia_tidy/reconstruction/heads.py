@@ -25,7 +25,7 @@ def make_head(
         repeats: factor of the number of its blocks, for :data:`DEEPENED` heads.
 
     Raises:
-        ValueError: if the name is unknown, the class cannot be imported or is no ``torch.nn.Module``, or the network
+        ValueError: if the name is unknown, the class cannot be imported or is not a ``torch.nn.Module``, or the network
             cannot have these channels, this width or more blocks.
 
     Example:
@@ -70,7 +70,7 @@ class OutsideHead(ReconstructionHead):
 
     Args:
         kind: class that is called with ``in_channels``, ``out_channels`` and, if given, ``width``. Its attribute
-            ``stride``, if it is a number, tells of which number the sides of its images are multiples.
+            ``stride``, if it is a number, is the number that divides the sides of its images.
         in_channels: channels of the image.
         out_channels: maps to estimate.
         width: channels of its first level, if it takes it.

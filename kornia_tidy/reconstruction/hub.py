@@ -128,13 +128,13 @@ def from_pretrained(
         cache_dir: folder of downloaded files. Default: huggingface_hub's.
         token: for a repository that is not public.
         local_files_only: take files that were downloaded before, and do not connect.
-        force_download: download again what was downloaded before.
+        force_download: download again in any case.
 
     Returns:
         The system in eval mode, on the CPU, with the record of its training. The sensor keeps its noise.
 
     Raises:
-        FileNotFoundError: if there is no such folder or file, and the name is not that of a repository.
+        FileNotFoundError: if the folder is missing or file, and the name is not that of a repository.
         ImportError: if a repository is asked for and huggingface_hub is missing.
         OSError: if a repository or its files cannot be downloaded.
         ValueError: if files are damaged, or weights and settings do not fit; the message names the difference.

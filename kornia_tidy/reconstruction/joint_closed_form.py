@@ -20,20 +20,20 @@ from kornia_tidy.reconstruction.residual import zero_last_convolution
 class JointClosedFormHead(ClosedFormHead):
     r"""Estimates image and distribution of depth by one network that refines the closed forms of both.
 
-    The network takes what :class:`ClosedFormHead` gives it, and the likelihood of each of L depths. All its maps but
+    The network takes the inputs of :class:`ClosedFormHead`, and the likelihood of each of L depths. All its maps but
     the last three are added to the logarithm of the likelihood, interpolated to D classes of depth. The image is that
     deconvolved for each depth, blended by the probability of the depth and smoothed by the bilateral filter; the last
     three maps are added to it. The last convolution is initialised with zeros: before training both are closed forms.
 
-    The network does not see the image, which depends on its depth. A second one may, and adds what is still missing.
+    The network does not see the image, which depends on its depth. A second one may, and adds the rest.
 
     Args:
         network: takes :func:`~kornia_tidy.reconstruction.closed_form.closed_form_channels` maps with the likelihood,
             returns D + 3, and ends in a convolution. The classes are evenly spaced over normalised inverse depth.
         layers: number L of depths, at least 2.
-        refiner: takes what a :class:`ClosedFormHead` with these layers gives its network, with the image in place of
-            the restored one; returns three maps, which are added to the image, and ends in a convolution, which is
-            initialised with zeros, too. None: the image is as above.
+        refiner: takes the inputs of a network in a :class:`ClosedFormHead` with these layers, with the image in place
+            of the restored one; returns three maps, which are added to the image, and ends in a convolution, which is
+            also initialised with zeros. None: the image is as above.
         encoded: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         inverse: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`: of estimates that the network
             takes, not of those for each depth.
@@ -113,7 +113,7 @@ class JointClosedFormHead(ClosedFormHead):
         return torch.cat([logits, image], 1)
 
     def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
-        """Return the logits of the classes by the likelihood in closed form alone, (B, D, H, W)."""
+        """Return the logits of the classes by only the likelihood in closed form, (B, D, H, W)."""
         return self._initial_logits(self.closed_form(capture, noise).maps)
 
     def _initial_logits(self, maps: Tensor) -> Tensor:
@@ -133,11 +133,11 @@ def widened_for_depth(weights: Mapping[str, Tensor], head: JointClosedFormHead) 
     likelihood are zero. The last convolution is that of ``head``, as the image was added to another closed form.
 
     Args:
-        weights: state of a :class:`ClosedFormHead` whose network has the kind and width of that in ``head``.
+        weights: state of a :class:`ClosedFormHead` with a network of the kind and width of that in ``head``.
         head: whose PSFs, noise, temperature, refiner and last convolution are taken; it is not changed.
 
     Returns:
-        A state for ``head``; weights of another kind of network stay as they are.
+        A state for ``head``; weights of another kind of network are unchanged.
     """
     assert head.network is not None
     named = head.network.named_modules(prefix="network")
@@ -159,12 +159,12 @@ def as_refiner(weights: Mapping[str, Tensor], head: JointClosedFormHead) -> dict
     Over the depths, whose number may differ, the weights of the first convolution are interpolated.
 
     Args:
-        weights: state of a :class:`ClosedFormHead` whose network has the kind and width of the refiner.
+        weights: state of a :class:`ClosedFormHead` with a network of the kind and width of the refiner.
         head: it is not changed.
 
     Returns:
-        A part of the state of ``head``, with the names that weights of the refiner have there; weights of another kind
-        of network stay as they are.
+        A part of the state of ``head``, with the refiner's names for its weights; weights of another kind of network
+        are unchanged.
     """
     assert head.refiner is not None
     place = "network."

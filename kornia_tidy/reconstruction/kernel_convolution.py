@@ -12,7 +12,7 @@ STEP = 4  # pixels of the output along a side that one strided convolution compu
 
 
 def convolve_kernels(image: Tensor, kernels: Tensor) -> Tensor:
-    r"""Convolve each channel of an image with kernels of its own, with padded borders.
+    r"""Convolve each channel of an image with its own kernels, with padded borders.
 
     .. math:: z_{dc} = k_{dc} * x_c
 

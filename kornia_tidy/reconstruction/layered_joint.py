@@ -61,13 +61,13 @@ class LayeredJointHead(ReconstructionHead):
     r"""Estimates depth as a distribution, and the image from the capture deconvolved for each depth.
 
     One network sees the capture, its brightness deconvolved for each of L depths, and the likelihood of these depths in
-    closed form. It estimates what the logarithm of the likelihood lacks; its last convolution is initialised with
+    closed form. It estimates a correction of the logarithm of the likelihood; its last convolution is initialised with
     zeros. The deconvolved captures are blended in linear light by the probabilities p of their depths:
 
     .. math:: \hat x = \sum_k p_k \, (w_k * y)
 
-    A second network sees the capture, this blend, and mean and standard deviation of the depth, and estimates what the
-    blend lacks, initially nothing.
+    A second network sees the capture, this blend, and mean and standard deviation of the depth, and estimates a
+    correction of the blend, initially zero.
 
     Args:
         depth_network: takes 3 + 2 L channels, returns D classes, evenly spaced over normalised inverse depth, and ends
@@ -91,8 +91,8 @@ class LayeredJointHead(ReconstructionHead):
         - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the filters.
         - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state.
 
-    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
-    form; the blend is the posterior mean if depth alone is uncertain. For the likelihood see
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), for a network behind the layers of a
+    closed form; the blend is the posterior mean if only depth is uncertain. For the likelihood see
     :func:`~kornia_tidy.reconstruction.depth_likelihood.depth_likelihood`.
 
     Example:
@@ -174,7 +174,7 @@ class LayeredJointHead(ReconstructionHead):
         return torch.cat([logits, refined.to(logits.dtype)], 1)
 
     def closed_form_logits(self, light: Tensor) -> Tensor:
-        """Return the logits of the classes by the likelihood in closed form alone, from linear light (B, 3, H, W)."""
+        """Return the logits of the classes by only the likelihood in closed form, from linear light (B, 3, H, W)."""
         return interpolated_classes(self._fits(light), self.out_channels - 3)
 
     def _fits(self, light: Tensor) -> Tensor:

@@ -49,8 +49,8 @@ class UncertainReconstruction(NamedTuple):
 class LightHead(nn.Module):
     """The network of a trained system with linear light as input, converted to the colour space of its training.
 
-    That is the camera's colour space: sRGB-encoded captures for ``"srgb"``, linear light for ``"linear"``, and also for
-    ``"paper"``, whose simulated sensor takes encoded values for light.
+    These are the camera's colours: sRGB-encoded captures for ``"srgb"``, linear light for ``"linear"``, and also for
+    ``"paper"``, since its simulated sensor takes encoded values for light.
 
     Args:
         system: camera and network, see :func:`~kornia_tidy.reconstruction.trained.load_trained`.
@@ -106,7 +106,7 @@ def with_noise_of(head: LightHead, sensor: SensorNoise | None) -> LightHead:
 
     Args:
         head: a network. One that is not conditioned on the noise takes no notice of it.
-        sensor: whose standard deviation is in units of the captures' full scale. None: the noise stays as it is.
+        sensor: with a standard deviation in units of the captures' full scale. None: the noise does not change.
     """
     copied = cast("LightHead", shared_copy(head))
     for module in copied.modules():

@@ -111,7 +111,7 @@ def chroma_psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) 
 
     .. math:: C_b = 0.564 \, (B - Y), \quad C_r = 0.713 \, (R - Y), \quad Y = 0.299 R + 0.587 G + 0.114 B
 
-    It is the error in colour alone: a change of brightness that is the same in all channels leaves it as it is.
+    It measures only the error in colour: a change of brightness that is equal in all channels does not change it.
 
     Args:
         prediction: (B, 3, H, W), RGB in [0, 1], encoded as sRGB.

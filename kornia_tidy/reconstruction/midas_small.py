@@ -31,7 +31,7 @@ class MiDaSSmall(ReconstructionHead):
 
     Convention:
         - The image is normalised inside, by ImageNet's mean and deviation. The published weights were trained on
-          pictures whose shorter side has 256 pixels and return inverse depth up to an unknown scale and shift:
+          pictures with 256 pixels along the shorter side and return inverse depth up to an unknown scale and shift:
           larger is nearer. The output of a network that is trained further depends on its training.
         - ``state_dict()`` has the published names, shapes and order. One of its units, in the coarsest fusion, is
           never used. It is frozen, so that optimisers and distributed training do not wait for its gradient.
@@ -153,7 +153,7 @@ def load_midas_small(path: str | os.PathLike[str]) -> MiDaSSmall:
         The network on the CPU, in training mode; call ``.eval()`` before use.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file holds anything but tensors, or other names or shapes than the network's.
 
     Source: the release 2.1 of MiDaS by Intel ISL (MIT licence).

@@ -57,8 +57,8 @@ CITATION = """\
 def model_card(system: TrainedSystem, title: str, license: str | None = None) -> str:  # noqa: A002
     """Return the model card of a trained system as Markdown with the Hugging Face Hub's metadata.
 
-    Numbers come from the system's settings, from those of its run, and from its record. What none of them tells is said
-    to be unknown.
+    Numbers come from the system's settings, from those of its run, and from its record. Missing facts are stated as
+    unknown.
 
     Args:
         system: the system, with ``record["scores"]`` by test set and name where it was scored.
@@ -98,7 +98,7 @@ def model_card(system: TrainedSystem, title: str, license: str | None = None) ->
 
 
 def check_license(license: str | None) -> None:  # noqa: A002
-    """Raise ``ValueError`` unless a licence is None or an identifier."""
+    """Raise ``ValueError`` unless a licence is None or has the form of an identifier."""
     if license is not None and not (isinstance(license, str) and _IDENTIFIER.fullmatch(license)):
         raise ValueError(f"license must be an identifier such as 'apache-2.0' or 'cc-by-nc-4.0', got {license!r:.80}")
 

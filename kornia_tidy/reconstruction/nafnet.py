@@ -93,11 +93,11 @@ class NAFNet(ReconstructionHead):
 
 
 def deepened(weights: Mapping[str, Tensor], head: nn.Module) -> dict[str, Tensor]:
-    """Return the weights of a network with those of the blocks that it lacks, which leave its result as it is.
+    """Return the weights of a network with those of its missing blocks, which do not change its result.
 
     Args:
         weights: state of a network with a :class:`NAFNet` of fewer blocks than the one in ``head``.
-        head: whose own blocks, with factors of zero, are added; it is not changed.
+        head: its blocks, with factors of zero, are added; it is not changed.
 
     Example:
         >>> small, large = NAFNet(width=4), NAFNet(width=4, repeats=2)
@@ -155,7 +155,7 @@ class _ChannelNorm(nn.LayerNorm):
 
 
 def _scaled(convolution: nn.Conv2d, scale: Tensor, features: Tensor) -> Tensor:
-    """Return the scale (1, C, 1, 1) times a 1x1 convolution; its weights are scaled, as they are fewer than pixels."""
+    """Return the scale (1, C, 1, 1) times a 1x1 convolution; its weights are scaled, being fewer than pixels."""
     assert convolution.bias is not None
     return functional.conv2d(features, convolution.weight * scale.transpose(0, 1), convolution.bias * scale.flatten())
 

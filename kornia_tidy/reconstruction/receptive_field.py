@@ -20,9 +20,9 @@ _found: WeakKeyDictionary[nn.Module, int] = WeakKeyDictionary()
 
 
 def total_stride(head: nn.Module) -> int:
-    """Return the shift of an image in pixels by which a network's output is shifted equally, and otherwise unchanged.
+    """Return the shift of an image in pixels that shifts a network's output equally without other changes.
 
-    It is the ``stride`` of the :class:`ReconstructionHead` in the network, and 1 if there is none.
+    It is the ``stride`` of the :class:`ReconstructionHead` in the network, and 1 without one.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet

@@ -69,11 +69,11 @@ class Refocused(ReconstructionHead):
           approximate.
         - Borders are padded as in :class:`ReconstructionHead`, and in the same way for the filters.
         - The filters are computed by :meth:`set_psfs` from the camera's PSFs and are not part of the state. In
-          training they are computed for every batch, and gradients reach the masks through them too.
+          training they are computed for every batch, and gradients also reach the masks through them.
 
-    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), whose network takes the layers of a closed
-    form. :class:`~kornia_tidy.reconstruction.tikhonov.Preconditioned` does this exactly, in linear light, with filters
-    as large as the picture.
+    Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), for a network behind the layers of a
+    closed form. :class:`~kornia_tidy.reconstruction.tikhonov.Preconditioned` does this exactly, in linear light, with
+    filters as large as the picture.
 
     Example:
         >>> from kornia_tidy.reconstruction.attention_unet import AttentionUNet

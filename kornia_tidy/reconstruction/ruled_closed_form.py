@@ -22,7 +22,7 @@ from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
 
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
-PLANE = 64  # samples along a side of the transfer function, by which bands are averaged
+PLANE = 64  # samples along a side of the transfer function, for averages over bands
 CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
 COLOR, COLOR_EXPONENT = 3.2, 0.76  # of the width in colour, by the noise that the filter leaves
 CONTENT = (0.03, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
@@ -42,7 +42,7 @@ class RuledClosedForm(ClosedForm):
 
     .. math:: J(k) = r \int S \, \big\langle |1 - K H|^2 \big\rangle \, df + \sigma^2 \lVert k \rVert_2^2
 
-    S is the power spectrum of photographs, and r what this scene holds of it: the power of differences between
+    S is the power spectrum of photographs, and r this scene's share of it: the power of differences between
     neighbouring pixels of the capture, less that of noise, over the one that photographs would have behind this camera;
     between .03 and 4. Kernels are of bounded size, so a PSF that fills its window is inverted less sharply. The width c
     of the bilateral filter in colour follows the standard deviation of the noise that the kernel leaves:
@@ -53,7 +53,7 @@ class RuledClosedForm(ClosedForm):
     says how near the rule comes to the best choice behind each: ``python -m tests.benchmarks.any_camera rule FOLDER``.
 
     Args:
-        layers: number of depths for each of which the brightness is deconvolved too, as inputs of a network.
+        layers: number of depths with a deconvolution of the brightness for each, as inputs of a network.
         encoded: captures are encoded as sRGB. False: they are linear light.
 
     Shape:
@@ -141,7 +141,7 @@ class RuledClosedForm(ClosedForm):
         return noise * curve[:, :, None, None]
 
     def _camera_maps(self, capture: Tensor, noise: Tensor) -> Tensor:
-        """Return what is known of the camera and of each pixel, (B, CAMERA_MAPS, H, W)."""
+        """Return maps of the camera's and each pixel's properties, (B, CAMERA_MAPS, H, W)."""
         noise = noise.clamp(min=LEAST_NOISE)
         place = (noise.log10() - math.log10(WIENER_NOISES[0])) / STEP
         facts = [self._left(noise, place)[..., 0, 0].log10() + 2, *(_at(table, place) for table in self.bands)]
@@ -156,7 +156,7 @@ def predicted_errors(psfs: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor]:
               \int S \, \langle |H|^2 \rangle (2 - \cos 2 \pi f_x - \cos 2 \pi f_y) \, df
 
     Args:
-        psfs: (D, C, P, P) with P odd, at depths whose defocus is evenly spaced, from the farthest to the nearest.
+        psfs: (D, C, P, P) with P odd, at depths of evenly spaced defocus, from the farthest to the nearest.
         kernels: (N, C, Q, Q) with Q odd.
 
     Returns:
@@ -182,13 +182,13 @@ def predicted_errors(psfs: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def band_facts(psfs: Tensor) -> Tensor:
-    r"""Return what share of a scene's power is not restored, and the transfer, in bands of frequency.
+    r"""Return the share of a scene's power that is not restored, and the transfer, in bands of frequency.
 
     .. math:: e_b = \frac{\sum_b S \, \big(1 - |\langle H \rangle|^2 / (\langle |H|^2 \rangle + \sigma^2 / S)\big)}
               {\sum_b S}
 
     Args:
-        psfs: (D, C, P, P) with P odd, at depths whose defocus is evenly spaced, from the farthest to the nearest.
+        psfs: (D, C, P, P) with P odd, at depths of evenly spaced defocus, from the farthest to the nearest.
 
     Returns:
         (2, N, 4) for N noises: e in each band, mean over the colours, and the mean of

@@ -1,4 +1,4 @@
-"""Self-ensemble: the mean of what a network returns for its input in several orientations."""
+"""Self-ensemble: the mean of a network's results for its input in several orientations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ORIENTATIONS = (1, 2, 4, 8)
 
 
 class SelfEnsemble(ReconstructionHead):
-    r"""Averages what a network returns for its input in several orientations, each turned back.
+    r"""Averages a network's results for its input in several orientations, each turned back.
 
     .. math:: y = \frac{1}{N} \sum_n T_n^{-1} f(T_n x)
 
@@ -22,8 +22,9 @@ class SelfEnsemble(ReconstructionHead):
         network: f. It must make sense of its input in any orientation. So does a network that sees a capture beside its
             restorations in closed form, although a turned capture has turned PSFs; one that sees only the capture, and
             has learnt the PSFs, does not.
-        orientations: N: 2 are the image as it is and turned by 180 degrees; 4 are all turns by 90 degrees; 8 are these
-            and their mirror images. It takes N times as long as the network alone, and about as much memory.
+        orientations: N: 2 are the unchanged image and the one turned by 180 degrees; 4 are all turns by 90 degrees; 8
+            are these and their mirror images. It takes N times as long as the network by itself, and about as much
+            memory.
 
     Shape:
         - image: (B, C, H, W), as the network takes it.
@@ -70,14 +71,14 @@ class SelfEnsemble(ReconstructionHead):
 def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
     """Return a copy of a trained head whose networks average over orientations; it shares the weights.
 
-    The closed form is computed once, for the capture as it is; its restorations are then turned. The images of
-    ``edof`` systems gain 0.10 to 0.14 dB by 8 orientations, ``joint-uncertain`` gains in depth alone, see "In several
+    The closed form is computed once, for the unturned capture; its restorations are then turned. The images of
+    ``edof`` systems gain 0.10 to 0.14 dB by 8 orientations, ``joint-uncertain`` gains only in depth, see "In several
     orientations" in ``docs/trained_systems.md``.
 
     Args:
         head: begins with the closed form: a :class:`ClosedFormHead` with a network, or a module that contains one, such
             as :class:`~kornia_tidy.reconstruction.JointHead`. It is not changed.
-        orientations: as for :class:`SelfEnsemble`. 1: the copy computes what the head does.
+        orientations: as for :class:`SelfEnsemble`. 1: the copy computes the same as the head.
 
     Raises:
         ValueError: for another number of orientations, or a head that does not begin with the closed form and so has

@@ -103,7 +103,7 @@ class LensSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class MaskSettings:
-    """What is learnt.
+    """The learnt task.
 
     Args:
         task: an image in focus everywhere (edof), depth, or both (joint).
@@ -111,7 +111,7 @@ class MaskSettings:
         start: heights of the masks at first, see :func:`~kornia_tidy.masks.initial_heights.initial_heights`. Those with
             fisher suit depth, the sweep edof; noise has any number of masks, the others five; flat, with one mask, is a
             lens without masks.
-        mask_size: pixels along a side of a mask, 20 of 23 of which span the aperture.
+        mask_size: pixels along a side of a mask; 20 of 23 span the aperture.
         seed: of the initial masks, and of everything random in a run.
     """
 
@@ -134,13 +134,13 @@ class CaptureSettings:
         bits: of the sensor's converter. None: no rounding.
         fidelity: speed or accuracy of the PSFs, see :class:`~kornia_tidy.fidelity.Fidelity`.
         window: side of the PSFs, odd. None: measured on the initial masks.
-        stray_light: what becomes of the light outside the window. None: as the fidelity has it.
+        stray_light: treatment of the light outside the window. None: as the fidelity has it.
         compositing: how depths are put together, see :class:`~kornia_tidy.TiDyOptics`. gather: each pixel collects
             light through its own depth's PSF, as the paper; scatter: each spreads its light, which conserves it;
             occlusion: near things hide far ones, slowest.
         color_space: srgb is decoded to linear light and encoded after; linear is light already; paper takes sRGB for
             light, as the paper does. None: srgb, or paper with that fidelity.
-        border: what lies beyond the picture; valid crops it to where all is known.
+        border: continuation of the picture beyond its edges; valid crops the capture instead.
     """
 
     measured: bool = False
@@ -274,7 +274,7 @@ class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSetting
         """Return the settings of a dictionary.
 
         Raises:
-            ValueError: if it is no dictionary, a name is unknown, or a value is not allowed or of another type.
+            ValueError: if it is not a dictionary, a name is unknown, or a value is not allowed or of another type.
         """
         known, unknown = cls.split(values)
         if unknown:
@@ -286,7 +286,7 @@ class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSetting
         """Split a dictionary into the settings of this class and all other entries.
 
         Raises:
-            ValueError: if it is no dictionary.
+            ValueError: if it is not a dictionary.
         """
         if not isinstance(values, Mapping):
             raise ValueError(f"settings must be values by name, got {values!r:.80}")
@@ -304,7 +304,7 @@ class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSetting
         """Read settings from a JSON file.
 
         Raises:
-            FileNotFoundError: if there is no file.
+            FileNotFoundError: if the file is missing.
             ValueError: if the file does not hold JSON of settings.
         """
         values = read_json(path)

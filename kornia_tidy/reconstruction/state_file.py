@@ -60,7 +60,7 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a state that :func:`write_state` wrote, to the CPU. No code from the file is run.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if the file is damaged or of another format.
 
     Convention:

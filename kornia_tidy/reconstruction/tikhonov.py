@@ -42,7 +42,7 @@ def tikhonov(
             that broadcasts to the half spectrum (B, C, H, W // 2 + 1).
         prior: :math:`x_0`, as ``capture``. None is black, which gives Wiener's filter if ``weight`` is the ratio of the
             power spectra of noise and image. With the capture as prior (Sitzmann et al.) white stays white, and
-            frequencies that the PSF does not pass stay as they are.
+            frequencies that the PSF does not pass are unchanged.
         veil: (C,) stray light, the fraction of light spread evenly over the image, or None.
         border: ``"smooth"`` or ``"circular"``.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.render.borders import next_fast_size
 
-MARGIN = 8  # px by which kernels extend beyond the PSF on each side
+MARGIN = 8  # px on each side of a kernel beyond the PSF
 
 
 def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:

@@ -23,8 +23,8 @@ class Span(NamedTuple):
 class TileGrid:
     r"""Overlapping tiles of an image.
 
-    Positions are in the image padded as by :class:`~kornia_tidy.reconstruction.ReconstructionHead`, whose sides P are
-    multiples of the stride. n tiles of side T that overlap by twice the margin R cover a side if
+    Positions are in the image padded as by :class:`~kornia_tidy.reconstruction.ReconstructionHead`, with sides P that
+    are multiples of the stride. n tiles of side T that overlap by twice the margin R cover a side if
 
     .. math:: T \\geq \\frac{P + 2 R (n - 1)}{n}
 
@@ -66,7 +66,7 @@ class TileGrid:
         return sides  # ty: ignore[invalid-explicit-return]
 
     def cheapest_sides(self, pixels: int) -> tuple[int, int] | None:
-        """Return the sides of the tile with the least computation and at most ``pixels``, or None if there is none."""
+        """Return the sides of the tile with the least computation and at most ``pixels``, or None if no tile fits."""
         choices = []
         for rows, columns in product(self._counts(0), self._counts(1)):
             sides = self._side(0, rows), self._side(1, columns)

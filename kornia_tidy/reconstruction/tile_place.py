@@ -46,7 +46,7 @@ class TilePlace(TorchFunctionMode):
     def __torch_function__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        """Replace interpolation by that for the tile's position; call all other functions as they are."""
+        """Replace interpolation by that for the tile's position; call all other functions unchanged."""
         kwargs = kwargs or {}
         if func is not functional.interpolate or not kwargs.get("align_corners"):
             return func(*args, **kwargs)

@@ -146,7 +146,7 @@ def shared_copy(head: nn.Module) -> nn.Module:
     """Return a copy of a network that shares its weights, for another picture at the same time.
 
     The noise of a picture and its stray light are kept in the closed form of a network, so that two threads need two
-    copies. What was measured for tiles is not measured again.
+    copies. Measurements for tiles are not repeated.
 
     Args:
         head: the network.

@@ -55,10 +55,10 @@ def build_optics(settings: SystemSettings, psfs: PSFBank | None = None) -> TiDyO
 
     Args:
         settings: of a system.
-        psfs: measured ones, for settings that say so.
+        psfs: measured PSFs, for settings with ``measured``.
 
     Raises:
-        ValueError: if measured PSFs are missing, or given where the settings do not say so.
+        ValueError: if measured PSFs are missing, or given without ``measured`` in the settings.
 
     Example:
         >>> build_optics(SystemSettings(masks=2, window=23)).window
@@ -132,12 +132,12 @@ def _network(settings: SystemSettings, out_channels: int, in_channels: int) -> R
 
 
 def update_psfs(head: nn.Module, optics: TiDyOptics) -> None:
-    """Update the PSFs of a network that deconvolves captures, from a camera as it is now.
+    """Update the PSFs of a network that deconvolves captures, from the present state of a camera.
 
     They are evenly spaced over the range of defocus: those of green light for
     :class:`~kornia_tidy.reconstruction.Refocused`, of all colours for
     :class:`~kornia_tidy.reconstruction.LayeredJointHead` and :class:`~kornia_tidy.reconstruction.ClosedForm`, which
-    takes the noise of the sensor too. Other networks are not changed. PSFs that were measured behind no colour filters
+    also takes the noise of the sensor. Other networks are not changed. PSFs that were measured behind no colour filters
     are those of all colours.
 
     Raises:
@@ -190,8 +190,8 @@ def load_trained(path: str | os.PathLike[str]) -> TrainedSystem:
         The system in eval mode, on the CPU. The sensor keeps its noise.
 
     Raises:
-        FileNotFoundError: if there is no file.
-        ValueError: if it is no checkpoint, or weights and settings do not fit; the message names the difference.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is not a checkpoint, or weights and settings do not fit; the message names the difference.
     """
     return system_of_state(read_state(path), path)
 
@@ -318,13 +318,13 @@ def load_weights(
 
 
 def camera_state(path: str | os.PathLike[str]) -> dict[str, Tensor]:
-    """Read the state of the camera in a file: what its ``state_dict()`` returned, alone or in a checkpoint.
+    """Read the state of the camera in a file: the result of its ``state_dict()``, by itself or in a checkpoint.
 
     Args:
         path: safetensors file of a camera's state, or of ``kornia-tidy train``.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is damaged.
     """
     tensors, header = read_tensors(path, WHAT)
@@ -338,10 +338,10 @@ def load_camera(path: str | os.PathLike[str]) -> TiDyOptics | None:
         path: as in :func:`camera_state`.
 
     Returns:
-        The camera; None where the file says nothing of one, such as that of masks alone.
+        The camera; None for a file without a camera, such as one of only masks.
 
     Raises:
-        FileNotFoundError: if there is no file.
+        FileNotFoundError: if the file is missing.
         ValueError: if it is damaged, or see :func:`~kornia_tidy.camera.saved_camera.camera_of_state`.
     """
     state = camera_state(path)
@@ -360,7 +360,7 @@ def load_masks(checkpoint: str | os.PathLike[str], optics: TiDyOptics) -> None:
     Args:
         checkpoint: path of a file that ``kornia-tidy train`` wrote, or of a camera's state, such as
             ``camera.safetensors`` of ``kornia-tidy design``.
-        optics: camera with as many masks of the same size. Its PSF window stays as it is. Pixel-wise masks without
+        optics: camera with as many masks of the same size. Its PSF window does not change. Pixel-wise masks without
             limits take the phase of masks of any family; others need their own family, limits and material.
 
     Raises:

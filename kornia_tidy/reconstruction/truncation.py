@@ -26,7 +26,7 @@ def plane_of(psfs: Tensor) -> int:
 def truncated(filters: Tensor, side: int) -> Tensor:
     """Truncate filters on a periodic plane to a window, and keep their sums.
 
-    A raised cosine fades them out over the outer half of their radius. A multiple of it makes up for what is cut off.
+    A raised cosine fades them out over the outer half of their radius. A multiple of it compensates the truncated part.
 
     Args:
         filters: (..., M, M), centred at the first pixel.

@@ -17,8 +17,8 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     """Let the closed forms in a network take away the stray light of a whole picture while they see parts of it.
 
     :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled` does so by itself for a network that takes captures as
-    its closed form does. One that encodes linear light before is told here. Closed forms that were told before keep
-    what they were told.
+    its closed form does. Give an encoding of linear light before the network here. Closed forms keep an encoding that
+    they were given before.
 
     Args:
         head: a network.
@@ -51,7 +51,7 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
 
 
 def closed_forms_without_statistics(head: nn.Module) -> list[ClosedForm]:
-    """Return the closed forms in a network that estimate stray light or noise from the mean light of their own input.
+    """Return the closed forms in a network that estimate stray light or noise from the mean light of their input.
 
     Example:
         >>> closed_forms_without_statistics(nn.Conv2d(3, 3, 1))

@@ -24,7 +24,7 @@ def wiener_kernels(psfs: Tensor, noises: tuple[float, ...], statistics: SceneSta
     kernel so that white becomes white.
 
     Args:
-        psfs: (D, C, P, P) with P odd and positive sums, at depths whose defocus is evenly spaced, from the farthest to
+        psfs: (D, C, P, P) with P odd and positive sums, at depths of evenly spaced defocus, from the farthest to
             the nearest.
         noises: standard deviation :math:`\sigma` of the noise for each kernel, in units of full scale.
         statistics: of the scenes; they give S and the weights of the depths.

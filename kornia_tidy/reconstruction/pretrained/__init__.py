@@ -32,7 +32,7 @@ def load_pretrained(name: str) -> TrainedSystem:
         task; :func:`~kornia_tidy.reconstruction.tasks.split_maps` returns them by name.
 
     Raises:
-        ValueError: if there is no system of this name.
+        ValueError: if there is not a system of this name.
 
     Example:
         >>> import torch
@@ -86,10 +86,10 @@ def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, sh
         checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
         path: of the new file.
         short: write the network's weights as :func:`~kornia_tidy.reconstruction.eight_bits.in_eight_bits` rounds them.
-            They are loaded as float32. False: they stay as they are.
+            They are loaded as float32. False: they do not change.
 
     Raises:
-        ValueError: if it is no checkpoint, has no moving average, or a weight is not finite or too large.
+        ValueError: if it is not a checkpoint, has no moving average, or a weight is not finite or too large.
     """
     state = read_state(checkpoint)
     wanted = ("optics.", "average.network.")
