@@ -17,6 +17,7 @@ STARTS = (
     "noise", "fisher, noise", "noisy fishers", "fisher, noisy fishers", "3 fishers, 2 noisy", "like fishers",
     "focal sweep", "flat",
 )  # fmt: skip
+MASK_FAMILIES = ("pixelwise", "fourier", "zernike", "radial", "spiral", "cubic", "none")
 INVERSES = ("tikhonov", "wiener")
 SYSTEMS = (
     "tidy-5", "tidy-1", "fresnel", "phasecam3d", "ikoma2021", "chang2019", "liu2022-pixelwise", "liu2022-spiral",

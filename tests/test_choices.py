@@ -18,6 +18,7 @@ from kornia_tidy.optics.lens import NAMED_LENSES
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.psf import psf_bank
 from kornia_tidy.reconstruction import metrics
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA
 from kornia_tidy.reconstruction.pretrained import FOLDER
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from kornia_tidy.reconstruction.tasks import MAPS
@@ -56,7 +57,7 @@ class TestChoices(BaseTester):
         assert getattr(choices, name) == tuple(named)
 
     def test_feature_pretrained_are_the_files(self):
-        assert set(choices.PRETRAINED) == {path.stem for path in FOLDER.glob("*.safetensors")}
+        assert {*choices.PRETRAINED, ANY_CAMERA} == {path.stem for path in FOLDER.glob("*.safetensors")}
 
     def test_feature_settings_of_training(self):
         assert tuple(settings.DATA) == tuple(data_sets.SCENES)

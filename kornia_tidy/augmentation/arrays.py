@@ -23,7 +23,7 @@ from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.reconstruction.trained import TrainedSystem
+from kornia_tidy.reconstruction.trained import TrainedSystem, any_camera_system, saved_system
 
 Color = Literal["bgr", "rgb"]
 IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
@@ -103,7 +103,7 @@ def simulate(
 
 def reconstruct(
     capture: NDArray[Any],
-    system: TrainedSystem | LightHead | str | os.PathLike[str] = "joint-5",
+    system: TiDyOptics | TrainedSystem | LightHead | str | os.PathLike[str] = "joint-5",
     *,
     color: Color = "bgr",
     linear: bool = False,
@@ -132,6 +132,9 @@ def reconstruct(
         >>> image, depth = reconstruct(capture)
         >>> image.shape, image.dtype, depth.shape, depth.dtype
         ((32, 48, 3), dtype('uint16'), (32, 48), dtype('float32'))
+        >>> image, depth = reconstruct(capture, TiDyOptics(fidelity="draft"))  # masks that no network was trained with
+        >>> image.shape, depth
+        ((32, 48, 3), None)
     """
     pixels = to_tensor(unmasked("capture", capture), color)
     head = _light_head(system)
@@ -244,8 +247,13 @@ def _light_head(system: Any) -> LightHead:
     if isinstance(system, str) and system in PRETRAINED:
         return _shipped(system)
     if isinstance(system, (str, os.PathLike)):
-        system = from_pretrained(system)
-    check_part("system", system, TrainedSystem, "a TrainedSystem, a LightHead, a name or a folder")
+        file = os.path.isfile(system)
+        system = saved_system(system) if file else from_pretrained(system)
+    if isinstance(system, TiDyOptics):
+        system = any_camera_system(system)
+    check_part(
+        "system", system, TrainedSystem, "a TiDyOptics, a TrainedSystem, a LightHead, a name, a file or a folder"
+    )
     return LightHead(system)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -14,18 +15,22 @@ from kornia_tidy.design.candidates import FOCI, flat_candidate
 from kornia_tidy.design.design_task import DesignTask, flat_mask
 from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.design.simulated_captures import DECISION
+from kornia_tidy.masks.families import random_masks
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_settings
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import depth_logits, split_maps
+from kornia_tidy.reconstruction.trained import any_camera_system
 from kornia_tidy.reconstruction.wiener import Wiener
 from kornia_tidy.sensor.exposure import exposed_sensor
 from kornia_tidy.sensor.noise import SensorNoise
 
 REFERENCE_F_NUMBER = DesignSettings.reference_f_number  # at which electrons are counted
 BILATERAL = (7, 0.14, (2.0, 2.0))  # px, difference of encoded colours, px
+MOST_DEFOCUS = 40.0  # rad between the ends of the depths of a camera that is made up
 STOPS = range(-4, 3)  # quarters of a factor of two around the balanced f-number
 
 
@@ -85,6 +90,38 @@ def shipped_cameras(electrons: float) -> dict[str, Camera]:
 
 def _rank(settings: SystemSettings) -> tuple[int, int, float]:
     return settings.masks, settings.depth_classes, settings.camera().f_number
+
+
+def made_up_camera(
+    family: str, num_masks: int, f_number: float, electrons: float, seed: int, lens: ThinLensCamera
+) -> Camera:
+    """Return a camera with random masks, whose captures the network for any camera restores without training.
+
+    Args:
+        family: of the masks, see :func:`~kornia_tidy.masks.families.random_masks`.
+        num_masks: in one exposure.
+        f_number: of the lens. Its depths end at infinity, and span at most 40 rad of defocus.
+        electrons: of a white pixel at the reference f-number.
+        seed: of the masks.
+        lens: whose focal length, pixels and nearest depth it takes.
+
+    Example:
+        >>> made_up_camera("spiral", 3, 12.0, 57_000, 0, ThinLensCamera()).f_number
+        12.0
+    """
+    masks = random_masks(family, num_masks, torch.Generator().manual_seed(seed))
+    radius = lens.focal_length / (2 * f_number)
+    dioptres = min(1 / lens.depth_range[0], MOST_DEFOCUS * REFERENCE_WAVELENGTH / (math.pi * radius**2))
+    camera = ThinLensCamera(
+        lens.focal_length,
+        f_number=f_number,
+        focus_distance=2 / dioptres,
+        pixel_pitch=lens.pixel_pitch,
+        depth_range=(1 / dioptres, math.inf),
+    )
+    optics = _exposed(TiDyOptics(masks, camera), electrons)
+    system = any_camera_system(optics)
+    return Camera(optics, system.head, system.settings)
 
 
 def stopped_down(lens: ThinLensCamera, electrons: float) -> Camera:

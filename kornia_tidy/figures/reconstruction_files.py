@@ -163,9 +163,10 @@ def reconstruct_files(
         result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
         size = write_reconstruction(paths[:-1], result, capture, head, depth_unit)
         record = {**made_of, "size": size, **(words or {}), **reconstruction_in_words(head, depth_unit)}
+        record |= {"notes": list(result.notes)} if result.notes else {}
         record |= {"noise": capture.noise.extra_repr()} if capture.noise is not None else {}
         write_bytes(paths[-1], (json.dumps(record, indent=1) + "\n").encode())
-        return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start)
+        return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start, result.notes)
 
     return work_on_all("reconstruct", list(outputs), work, jobs)
 

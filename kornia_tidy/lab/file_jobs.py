@@ -20,6 +20,8 @@ class Row(NamedTuple):
     result: str
     size: str = ""
     seconds: float | None = None
+    notes: tuple[str, ...] = ()
+    """What there is to tell of the file; not in the table."""
 
 
 def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:

@@ -16,7 +16,7 @@ from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.capture_file import CaptureLight
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.closed_form import ClosedForm
-from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.settings import SystemSettings
@@ -65,10 +65,8 @@ def noise_settings(sensor: SensorNoise) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def closed_form_system(
-    psfs: MeasuredPSFs, sensor: SensorNoise | None = None, head: str = "wiener-bilateral"
-) -> TrainedSystem:
-    """Return a camera that was measured with the closed form that restores its captures, without training.
+def closed_form_system(psfs: MeasuredPSFs, sensor: SensorNoise | None = None, head: str = ANY_CAMERA) -> TrainedSystem:
+    """Return a camera that was measured with what restores its captures without training.
 
     Args:
         psfs: the measurement, of one or three colours.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +14,9 @@ from kornia_tidy.reconstruction.closed_form import closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.nafnet import NAFNet
 from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, RuledClosedForm
+from kornia_tidy.reconstruction.state_file import read_state
+
+WEIGHTS = Path(__file__).parent / "pretrained" / "any-camera.safetensors"
 
 SHARE = 1.0  # logit of the share before training
 
@@ -29,12 +34,11 @@ class AnyCameraHead(ClosedFormHead):
         width: of the :class:`~kornia_tidy.reconstruction.NAFNet`.
         repeats: of its blocks.
         layers: number of depths with a deconvolution among the inputs.
-        encoded: captures are encoded as sRGB. False: they are linear light.
 
     Shape:
-        - image: (B, 3, H, W), captures of the camera, of any size.
+        - image: (B, 3, H, W), captures of the camera encoded as sRGB, of any size.
         - noise: as for :class:`~kornia_tidy.reconstruction.ClosedFormHead`.
-        - output: (B, 3, H, W), the image in the colours of the capture.
+        - output: (B, 3, H, W), the image, encoded as sRGB.
 
     Raises:
         ValueError: if no PSFs were given before the first capture.
@@ -55,9 +59,9 @@ class AnyCameraHead(ClosedFormHead):
         True
     """
 
-    def __init__(self, width: int = 16, repeats: int = 3, layers: int = 7, *, encoded: bool = True) -> None:
-        super().__init__(None, encoded=encoded)
-        self.closed_form = RuledClosedForm(layers, encoded=encoded)
+    def __init__(self, width: int = 16, repeats: int = 3, layers: int = 7) -> None:
+        super().__init__()
+        self.closed_form = RuledClosedForm(layers)
         network = NAFNet(closed_form_channels(layers) + CAMERA_MAPS, 4, width, repeats)
         nn.init.zeros_(network.last.weight)
         network.last.bias = nn.Parameter(torch.tensor([SHARE, 0.0, 0.0, 0.0]))
@@ -69,6 +73,24 @@ class AnyCameraHead(ClosedFormHead):
         """Return the image from the capture and the map of its noise, (B, 6, H, W)."""
         restored = self.closed_form(*image.split(3, 1))
         return corrected(restored.image, self.network(restored.maps))
+
+
+@cache
+def _shipped() -> dict[str, Tensor]:
+    return read_state(WEIGHTS)["network"]
+
+
+def any_camera_head() -> AnyCameraHead:
+    """Return the network that is shipped, which waits for the PSFs of a camera.
+
+    Example:
+        >>> sum(parameter.numel() for parameter in any_camera_head().parameters()) // 1000
+        2425
+    """
+    head = AnyCameraHead().eval()
+    if not head.network.last.weight.is_meta:  # else shapes alone are wanted
+        head.network.load_state_dict(_shipped())
+    return head
 
 
 def corrected(image: Tensor, maps: Tensor) -> Tensor:

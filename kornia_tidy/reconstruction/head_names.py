@@ -15,8 +15,9 @@ HEADS = {
     "plain": "kornia_tidy.reconstruction.heads:PlainHead",
     "zoedepth": "kornia_tidy.reconstruction.baselines:zoedepth",
 }
-CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral", "wiener", "wiener-bilateral")
-"""Heads without a network, whose result is :class:`~kornia_tidy.reconstruction.closed_form_head.ClosedFormHead`'s."""
+ANY_CAMERA = "any-camera"
+CLOSED_FORMS = ("tikhonov", "tikhonov-bilateral", "wiener", "wiener-bilateral", ANY_CAMERA)
+"""Heads that need a camera's PSFs and no training with it: closed forms, and the shipped network that corrects one."""
 FIXED = ("midas-small",)  # three input channels, and one width
 DEEPENED = ("nafnet",)  # take the number of their blocks, as repeats
 
@@ -29,8 +30,8 @@ def check_head(name: str) -> None:
         Traceback (most recent call last):
         ...
         ValueError: head must be one of 'attention-unet', 'depth-anything-v2', 'nafnet', 'phasecam3d', 'midas-small', \
-'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', 'wiener', 'wiener-bilateral', or the path of a class such as \
-my_package.networks:Network, got 'nafnett'
+'plain', 'zoedepth', 'tikhonov', 'tikhonov-bilateral', 'wiener', 'wiener-bilateral', 'any-camera', or the path \
+of a class such as my_package.networks:Network, got 'nafnett'
     """
     known = (*HEADS, *CLOSED_FORMS)
     module, colon, attribute = name.partition(":")

@@ -11,16 +11,23 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.reconstruction.any_camera import AnyCameraHead
+from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
 from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.receptive_field import receptive_field
+from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.self_ensemble import self_ensemble
 from kornia_tidy.reconstruction.tasks import MAPS, depth_logits, deviation_in_metres, metres, split_maps
 from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
 from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.reconstruction.whole_picture import whole_picture
 from kornia_tidy.sensor.noise import SensorNoise
+
+FIELD_TILE = 384  # px, within which the PSFs of its middle serve; each tile costs a computation of kernels
 
 
 class Reconstruction(NamedTuple):
@@ -30,6 +37,8 @@ class Reconstruction(NamedTuple):
     """All-in-focus image, (3, H, W) in [0, 1], encoded as sRGB."""
     depth: Tensor | None
     """Depth in metres, (1, H, W); may be infinite."""
+    notes: tuple[str, ...] = ()
+    """What was repaired in the capture, and what contradicts what is told of it, each with its remedy."""
 
 
 class UncertainReconstruction(NamedTuple):
@@ -44,6 +53,8 @@ class UncertainReconstruction(NamedTuple):
     :func:`~kornia_tidy.reconstruction.tasks.deviation_in_metres`."""
     relative_deviation: Tensor
     """The same in parts of the range, of normalised inverse depth: 0.29 where nothing is known."""
+    notes: tuple[str, ...] = ()
+    """As in :class:`Reconstruction`."""
 
 
 class LightHead(nn.Module):
@@ -65,7 +76,7 @@ class LightHead(nn.Module):
           ``uncertain``.
 
     Raises:
-        TypeError: if the camera has no metric scale.
+        TypeError: if the network estimates depth and the camera has no metric scale.
         ValueError: if a noise is given that is not positive, or the network is not conditioned on it; for orientations
             that are not offered, or a network that knows PSFs in one orientation.
     """
@@ -76,14 +87,16 @@ class LightHead(nn.Module):
             check_positive("noise", noise, "in units of full scale")
             if not takes_noise(system.head):
                 raise ValueError("noise is for a network that is conditioned on it, and this one is not")
-        if not isinstance(system.optics.camera, ThinLensCamera):
+        if "depth" in MAPS[system.settings.task] and not isinstance(system.optics.camera, ThinLensCamera):
             raise TypeError(f"depth in metres needs a ThinLensCamera, got {type(system.optics.camera).__name__}")
         self.head = system.head if orientations == 1 else self_ensemble(system.head, orientations)
         self.noise = noise
         self.task = system.settings.task
-        self.camera = system.optics.camera
+        self.camera = cast("ThinLensCamera", system.optics.camera)  # another one where no depth is estimated
         self.encoded = system.optics.color_space == "srgb"
         self.uncertain = system.settings.depth_classes > 0
+        behind = isinstance(system.head, AnyCameraHead) and system.optics.lens is not None
+        self.field = (system.optics.psf_model, system.optics.field_center) if behind else None  # no part of the head
         self.eval()
 
     def forward(self, light: Tensor) -> tuple[Tensor, ...]:
@@ -147,7 +160,10 @@ def reconstruct_light(
     check_float_tensor("light", light, 3, "(3, H, W) or (1, H, W)")
     if light.shape[0] not in {1, 3} or 0 in light.shape:
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
+    light, _, notes = check_capture(light, _told_noise(head))
     colours = light.expand(3, -1, -1)[None]
+    if head.field is not None:
+        return Reconstruction(_over_field(head, colours, *head.field)[0], None, notes)
     with whole_picture(head, colours):
         cut = None
         if one_tile(head, colours, memory_budget) is None:
@@ -160,7 +176,29 @@ def reconstruct_light(
     if image is not None:
         image.clamp_(0, 1)
     if image is None or near is None or not head.uncertain:
-        return Reconstruction(image, None if near is None else metres(head.camera, near))
+        return Reconstruction(image, None if near is None else metres(head.camera, near), notes)
     deviation = named["deviation"]
     in_metres = deviation_in_metres(head.camera, near, deviation)
-    return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation)
+    return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation, notes)
+
+
+def _over_field(head: LightHead, light: Tensor, model: PSFModel, center: tuple[float, float]) -> Tensor:
+    """Restore a capture through a real lens by the network for any camera, with the PSFs of each place."""
+    own = shared_copy(head)
+    form = next(part for part in own.modules() if isinstance(part, ClosedForm))
+    nodes = torch.linspace(*model.camera.defocus_range, form.layers, dtype=torch.float64).tolist()
+
+    def restore(part: Tensor, bank: PSFBank) -> Tensor:
+        form.set_psfs(bank.at_defocus(nodes))
+        return own(part)[0]
+
+    with whole_picture(own, light):
+        return restored_over_field(light, model, restore, center=center, tile=FIELD_TILE).clamp(0, 1)
+
+
+def _told_noise(head: LightHead) -> MeasuredNoise | None:
+    """Return the noise by which a network restores captures; None if it does not take it."""
+    if head.noise is not None:
+        return MeasuredNoise(head.noise**2, 0.0)
+    models = [part.noise_model.tolist() for part in head.modules() if isinstance(part, ClosedForm)]
+    return MeasuredNoise(*models[0]) if models else None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from kornia.color import rgb_to_linear_rgb
+from safetensors.torch import save_file
 
 import kornia_tidy
 from kornia_tidy import PixelwiseMask, TiDyOptics
@@ -14,6 +15,7 @@ from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
 from kornia_tidy.data import from_opencv, read_rgbd, to_opencv
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.trained import any_camera_system
 from tests.base import BaseTester
 
 MOST = {"uint8": 255, "uint16": 65535, "float32": 1}
@@ -147,7 +149,7 @@ class TestReconstruct(BaseTester):
         assert depth.shape == (2, 32, 48)
         given = capture[1] if kind != "float32" else np.rint(65535 * capture[1]).astype(np.uint16)
         light = rgb_to_linear_rgb(from_opencv(given))
-        found, metres = reconstruct_light(head, light)
+        found, metres, _ = reconstruct_light(head, light)
         expected, metres = to_opencv(found, given.dtype), metres[0].numpy()
         most = np.iinfo(given.dtype).max
         assert np.abs(image[1] / MOST[kind] - expected / most).max() < 1e-3
@@ -176,7 +178,7 @@ class TestReconstruct(BaseTester):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), "joint-9")
         with pytest.raises(ValueError, match=r"image must have shape .*, got \(8, 8, 4\): drop alpha"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 4), head)
-        with pytest.raises(TypeError, match="system must be a TrainedSystem"):
+        with pytest.raises(TypeError, match="system must be a TiDyOptics, a TrainedSystem"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), 5)
 
 
@@ -230,3 +232,15 @@ class TestBehindALens(BaseTester):
         self.assert_close(torch.from_numpy(seen).movedim(-1, 0), expected, rtol=0, atol=1e-4)
         with pytest.raises(ValueError, match="optics has a lens of its own"):
             kornia_tidy.simulate(image, depth, optics=TiDyOptics(), lens="single-50mm")
+
+
+class TestReconstructAnyCamera(BaseTester):
+    def test_feature_a_camera_its_file_and_its_system_give_the_same_picture(self, tmp_path):
+        optics = TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(1)), fidelity="draft")
+        save_file(optics.state_dict(), path := tmp_path / "camera.safetensors")
+        capture = (255 * np.random.default_rng(0).random((48, 64, 3))).astype(np.uint8)
+        system = any_camera_system(optics)
+        images = [kornia_tidy.reconstruct(capture, camera).image for camera in (optics, path, str(path), system)]
+        assert all(np.array_equal(image, images[0]) for image in images)
+        assert images[0].shape == capture.shape
+        assert not np.array_equal(kornia_tidy.reconstruct(capture, TiDyOptics(fidelity="draft")).image, images[0])

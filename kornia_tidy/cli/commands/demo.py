@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from kornia_tidy.choices import MASK_FAMILIES
 from kornia_tidy.cli.commands.shared import Folder, OwnScene, check_folder
 from kornia_tidy.design.settings import DesignSettings
-from kornia_tidy.settings import Pixels, Seed, Unit
+from kornia_tidy.settings import FNumber, Pixels, Seed, Unit, one_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from kornia_tidy.data.rgbd import Scene
-    from kornia_tidy.design.compared_cameras import Result
+    from kornia_tidy.design.compared_cameras import Camera, Result
     from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 LARGEST = 1024  # pixels of the longer side; larger pictures are made smaller, to keep a demonstration short
@@ -29,12 +30,17 @@ class Demo:
     masks that is stopped down: the same exposure time and the same light. Both captures are
     restored in closed form and, where a trained network is shipped for the camera, by the
     network. A third camera estimates the depth of every pixel. All scores are on the page.
+    Masks, family or f-number make up another camera, whose captures the network for any
+    camera restores, without training.
     The depths of your own scene are stretched, in dioptres, over the range for which the
     masks were made.
 
     Args:
         output: made if missing.
         electrons: of a white pixel at f/17.6; less is dimmer light.
+        masks: number of random masks of a camera that is made up. None: 5, if one is made up.
+        family: of its masks. None: pixelwise, if one is made up.
+        f_number: of its lens. None: 17.6, if one is made up.
         size: side of the scene made here.
         seed: of scene and noise.
         scene: to be photographed.
@@ -42,6 +48,9 @@ class Demo:
 
     output: Folder = "outputs"
     electrons: Annotated[float, Unit("E", "electrons", 0, above=True)] = DesignSettings.electrons
+    masks: Annotated[int, Unit("K", "", 1, 64)] | None = None
+    family: Annotated[str, one_of(MASK_FAMILIES)] | None = None
+    f_number: FNumber | None = None
     size: Pixels = 512
     seed: Seed = 5  # of a scene of many kinds of texture
     scene: OwnScene = field(default_factory=OwnScene)
@@ -49,6 +58,7 @@ class Demo:
     examples: ClassVar = """\
   kornia-tidy demo
   kornia-tidy demo --electrons 500                                      dim light
+  kornia-tidy demo --masks 3 --family spiral --f-number 12              a camera made up here
   kornia-tidy demo --image photo.png --depth depth.png --depth-scale 0.001
 """
 
@@ -58,7 +68,7 @@ class Demo:
         import torch
 
         from kornia_tidy.cli.commands.report import Stages, clamped_in_words, progress_bar, scene_in_words, tell
-        from kornia_tidy.design.compared_cameras import photograph, shipped_cameras, stopped_down
+        from kornia_tidy.design.compared_cameras import photograph, stopped_down
         from kornia_tidy.figures.demonstration import (
             comparison_page,
             explained_page,
@@ -82,7 +92,7 @@ class Demo:
 
         with torch.no_grad(), progress:
             with step("scene"):
-                cameras = shipped_cameras(self.electrons)
+                cameras = self._cameras()
                 lens = cameras["coded"].optics.camera
                 assert isinstance(lens, ThinLensCamera)  # as in the training of the systems
                 scene = self._scene(lens)
@@ -115,6 +125,23 @@ class Demo:
         for name in pictures:
             tell("", str(folder / name))
         tell("time", stages.summary())
+
+    def _cameras(self) -> dict[str, Camera]:
+        """Return the shipped cameras, or the one that is made up in place of that with masks."""
+        from kornia_tidy.design.compared_cameras import REFERENCE_F_NUMBER, made_up_camera, shipped_cameras
+        from kornia_tidy.optics.thin_lens import ThinLensCamera
+
+        cameras = shipped_cameras(self.electrons)
+        if (self.masks, self.family, self.f_number) != (None, None, None):
+            cameras["coded"] = made_up_camera(
+                self.family or "pixelwise",
+                self.masks or 5,
+                self.f_number or REFERENCE_F_NUMBER,
+                self.electrons,
+                self.seed,
+                ThinLensCamera(),
+            )
+        return cameras
 
     def _scene(self, camera: ThinLensCamera) -> Scene:
         """Return a colour scene with depths stretched over the camera's range."""

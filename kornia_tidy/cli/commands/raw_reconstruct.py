@@ -10,7 +10,7 @@ from kornia_tidy.choices import ORIENTATIONS, PRETRAINED
 from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
 from kornia_tidy.cli.commands.shared import File, Folder, Noise, read_noise
-from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
@@ -41,8 +41,9 @@ class ReconstructRaw:
     Args:
         files: camera raw files, or pictures.
         output: where to; made if it is not there.
-        head: a shipped system, or a checkpoint of a training (best.safetensors), or, with PSFs, a closed form. None:
-            with PSFs wiener-bilateral.
+        head: a shipped system, a checkpoint of a training (best.safetensors), or the file of a camera, such as
+            camera.safetensors of kornia-tidy design, whose captures the network for any camera restores; or, with PSFs,
+            a closed form. None: with PSFs the network for any camera.
         psfs: file of kornia-tidy raw calibrate-psf; its PSFs deconvolve the captures. None:
             those of the network's camera.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
@@ -87,8 +88,10 @@ class ReconstructRaw:
         *("jobs", "memory", "orientations", "device"),
     )
     notes: ClassVar = """\
-A network fits the camera that it was trained with, so HEAD must be trained with the
-masks and lens of the captures. The library includes, for a 50 mm lens and pixels of 8 um
+Without a network of your camera, give the camera: its file as HEAD, or its measured PSFs.
+One network, any-camera, restores the captures of any camera that it is told. All others fit
+the camera that they were trained with, its masks and its lens. The library includes, for a
+50 mm lens and pixels of 8 um
   edof-5, edof-1, edof-0      picture: five masks, one, a Fresnel element; f/17.6, at 0.6 m
   edof-designed               picture: five masks; f/22, at 1.98 m
   edof-flat                   picture: no masks; f/48, at 0.74 m
@@ -112,7 +115,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
   A better picture, in seven times the time:
     kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o best --orientations 8
 
-  A camera that was measured, without a network:
+  A camera of your own design, and one that was measured, without training:
+    kornia-tidy raw reconstruct shots/*.dng --head camera.safetensors -o sharp
     kornia-tidy raw reconstruct shots/*.dng --psfs bank.safetensors --noise iso800.json -o sharp
 
   A network of one's own; of two files, one is read and written while the other is computed:
@@ -124,7 +128,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         import torch
 
         from kornia_tidy.cli.commands.report import tell
-        from kornia_tidy.cli.commands.system_options import CLOSED_FORM, load_system
+        from kornia_tidy.cli.commands.system_options import load_system
         from kornia_tidy.figures.reconstruction_files import reconstruct_files
         from kornia_tidy.lab.file_jobs import table
         from kornia_tidy.lab.measured import check_capture, takes_psfs
@@ -148,7 +152,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
                 check_capture(system, path, capture)
             return capture
 
-        words = {"head": self.head or CLOSED_FORM} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
+        words = {"head": self.head or ANY_CAMERA} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
         folder = Path(self.output)
         rows = reconstruct_files(
             self.files,
@@ -169,6 +173,9 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         failed = sum(row.result not in {"done", "kept"} for row in rows)
         for line in table(rows):
             print(line)
+        for row in rows:
+            for note in row.notes:
+                tell("note", f"{row.file}: {note}")
         tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
         if failed:
             raise ValueError(f"{failed} of {len(rows)} files failed")

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.files import read_bytes
-from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.pretrained import FOLDER
 
 if TYPE_CHECKING:
     from kornia_tidy.reconstruction.trained import TrainedSystem
     from kornia_tidy.sensor.noise import SensorNoise
-
-CLOSED_FORM = "wiener-bilateral"  # restores measured cameras where no network is named
 
 
 def head_file(head: str) -> Path:
@@ -28,9 +26,11 @@ def head_file(head: str) -> Path:
     if head in PRETRAINED:
         return FOLDER / f"{head}.safetensors"
     if head in CLOSED_FORMS:
-        raise ValueError(f"the closed form {head!r} needs the PSFs of a camera: give --psfs")
+        raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs")
     if not Path(head).exists():
-        raise FileNotFoundError(f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file {head}")
+        raise FileNotFoundError(
+            f"a system is {', '.join(PRETRAINED)}, a checkpoint, or a saved camera: there is no file {head}"
+        )
     return Path(head)
 
 
@@ -38,7 +38,8 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
     """Return the system that is named, behind the camera that was measured.
 
     Args:
-        head: name of a shipped system or of a closed form, or a checkpoint. None: the closed form of measured PSFs.
+        head: name of a shipped system or of a closed form, a checkpoint, or the file of a camera, whose captures the
+            network for any camera restores. None: that network, by measured PSFs.
         psfs: file of measured PSFs.
         sensor: measured noise. None: the system's own.
 
@@ -49,15 +50,15 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
     """
     from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
     from kornia_tidy.lab.measured import closed_form_system, with_measurements
-    from kornia_tidy.reconstruction.trained import load_trained
+    from kornia_tidy.reconstruction.trained import saved_system
 
     if head is None and psfs is None:
-        raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, or --psfs")
+        raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, a saved camera, or --psfs")
     measured = None if psfs is None else MeasuredPSFs.load(psfs)
     if measured is not None and (head is None or head in CLOSED_FORMS):
-        return closed_form_system(measured, sensor, head or CLOSED_FORM)
+        return closed_form_system(measured, sensor, head or ANY_CAMERA)
     assert head is not None
-    system = load_trained(head_file(head))
+    system = saved_system(head_file(head), sensor)
     return system if measured is None and sensor is None else with_measurements(system, measured, sensor)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,10 @@ from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera
+from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED, RuledClosedForm
+from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.sensor.noise import SensorNoise
@@ -206,3 +209,8 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
             path.with_suffix(".partial").rename(path)
     record = {"step": step, "log": log}
     write_bytes(folder / "training.json", json.dumps(record).encode())
+
+
+def ship(weights: Mapping[str, Tensor], path: Path) -> None:
+    """Write weights of the network as the package holds them, in eight bits."""
+    write_state(path, {"network": in_eight_bits(weights, list(weights))})

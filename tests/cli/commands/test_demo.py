@@ -57,6 +57,19 @@ class TestDemo(BaseTester):
         assert slow > fast
 
     @pytest.mark.takes_seconds
+    def test_feature_a_camera_made_up_on_the_command_line_is_restored_without_training(self, tmp_path, capsys):
+        made_up = ["--masks", "2", "--family", "zernike", "--f-number", "20"]
+        assert main(["demo", "-o", str(tmp_path), "--size", "128", *made_up]) == 0
+        (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("coded"))
+        assert "2 masks, f/20" in line
+        capture, closed_form, network = (float(value) for value in re.findall(r"([\d.]+) dB", line))
+        assert min(closed_form, network) > capture
+
+    def test_exception_families_are_named(self, tmp_path, capsys):
+        assert main(["demo", "-o", str(tmp_path), "--family", "lens"]) == 2
+        assert "spiral" in capsys.readouterr().err
+
+    @pytest.mark.takes_seconds
     def test_feature_a_scene_of_ones_own_is_stretched_over_the_range(self, tmp_path, capsys):
         write_image(tmp_path / "image.png", torch.rand(1, 64, 96))
         write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))

@@ -92,7 +92,7 @@ class TestRawReconstruct(BaseTester):
         files, weights, folder = batch
         assert reconstruct(files[:1], weights, folder, "--linear") == 0
         head = LightHead(load_trained(weights))
-        image, depth = reconstruct_light(head, read_image(files[0]))
+        image, depth, _ = reconstruct_light(head, read_image(files[0]))
         assert (read_image(folder / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-7
         assert (read_image(folder / "a.jpg") - image).abs().mean() < 0.02
         exact = np.load(folder / "a_depth.npy")
@@ -153,7 +153,7 @@ class TestRawReconstruct(BaseTester):
         assert reconstruct([files[0], *bad, *files[1:]], weights, folder, "--jobs", jobs) == 2
         out, err = capsys.readouterr()
         assert {path.stem for path in folder.glob("*.json")} == {"a", "b", "c"}
-        lines = [line.split(maxsplit=1) for line in out.splitlines()[1:-1]]
+        lines = [line.split(maxsplit=1) for line in out.splitlines()[1:-1] if not line.startswith("note")]
         assert [file for file, _ in lines] == ["file", files[0], *bad, *files[1:]]  # the table, in the order asked for
         assert [said.endswith("done") for _, said in lines[1:]] == [True, False, False, False, True, True]
         reasons = ("not an image", "it is cut short", "there is no such file")
@@ -235,7 +235,7 @@ class TestRawReconstruct(BaseTester):
         assert reconstruct([str(tmp_path / "a.dng")], "edof-0", tmp_path) == 0
         assert json.loads((tmp_path / "a.json").read_text())["head"] == "edof-0"
         light = develop(RawCapture.open(tmp_path / "a.dng"), encoded=False, upright=False)
-        image, _ = reconstruct_light(LightHead(load_pretrained("edof-0")), light)
+        image, *_ = reconstruct_light(LightHead(load_pretrained("edof-0")), light)
         assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
 
     def test_feature_dumps_are_developed_linearly(self, tmp_path):
@@ -293,7 +293,7 @@ class TestRawReconstruct(BaseTester):
             ([files, files[0], folder], "is no checkpoint of kornia_tidy"),
             (
                 [files, "edof-7", folder],
-                f"a system is {', '.join(PRETRAINED)}, or a checkpoint: there is no file edof-7",
+                f"a system is {', '.join(PRETRAINED)}, a checkpoint, or a saved camera: there is no file edof-7",
             ),
             ([files, wide, folder, "--memory", "1"], "the smallest tile of this head"),
         ):

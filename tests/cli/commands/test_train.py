@@ -201,4 +201,4 @@ class TestEvaluate(BaseTester):
         assert main(["evaluate", str(tmp_path / "a.ckpt")]) == 2
         assert "it is no checkpoint of kornia_tidy" in capsys.readouterr().err
         assert main(["evaluate", str(tmp_path / "b.ckpt")]) == 2
-        assert "or a checkpoint: there is no file" in capsys.readouterr().err
+        assert "a checkpoint, or a saved camera: there is no file" in capsys.readouterr().err

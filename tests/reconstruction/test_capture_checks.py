@@ -1,0 +1,126 @@
+"""Captures as they come: outliers, noise, JPEG, encoding, each made here."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+
+from kornia_tidy import SensorNoise
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.data import photographic_leaves
+from kornia_tidy.reconstruction.capture_checks import (
+    JPEG,
+    MeasuredNoise,
+    blockiness,
+    check_capture,
+    measure_noise,
+    repair_outliers,
+)
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
+from kornia_tidy.reconstruction.trained import any_camera_system
+from tests.base import BaseTester
+
+
+def capture(electrons=20_000.0, side=320, seed=3):
+    """Blurred light of a painted scene by a sensor of 2.4 electrons read noise, (3, H, W)."""
+    image, _ = photographic_leaves(side + 4, side + 4, seed=seed)
+    light = torch.nn.functional.avg_pool2d(rgb_to_linear_rgb(image[None]), 5, 1)
+    sensor = SensorNoise(2.4 / electrons, full_well=electrons)
+    return sensor(light, generator=torch.Generator().manual_seed(0))[0], sensor
+
+
+def told(sensor):
+    return MeasuredNoise(sensor.sigma**2, 1 / sensor.full_well)
+
+
+def with_outliers(light, share):
+    drawn = torch.rand(light.shape, generator=torch.Generator().manual_seed(5))
+    return torch.where(drawn < share / 2, 1.0, torch.where(drawn < share, 0.0, light)), drawn < share
+
+
+class TestRepairOutliers(BaseTester):
+    def test_feature_hot_and_dead_pixels_are_found_and_no_others(self):
+        light, sensor = capture()
+        marked, places = with_outliers(light, 1e-3)
+        repaired = repair_outliers(marked, told(sensor))
+        changed = repaired.light != marked
+        far = (marked - light).abs() > 0.1  # a dead pixel in the dark is none that shows
+        assert (changed & places & far).sum() >= 0.95 * (places & far).sum()
+        assert (changed & ~places).sum() <= 3
+        before, after = ((one - light).square().mean() for one in (marked, repaired.light))
+        assert after < 0.03 * before
+
+    def test_feature_an_undisturbed_capture_stays(self):
+        for electrons in (300.0, 100_000.0):
+            light, sensor = capture(electrons)
+            assert repair_outliers(light, told(sensor)).count <= 3
+
+    def test_feature_rows_that_are_worked_on_apart_are_the_whole(self):
+        light, sensor = capture(side=520)
+        marked, _ = with_outliers(light, 1e-3)
+        whole, turned = (repair_outliers(part, told(sensor)).light for part in (marked, marked.transpose(1, 2)))
+        assert torch.equal(whole, turned.transpose(1, 2))
+
+    def test_feature_corners_have_neighbours(self):
+        light = torch.full((1, 4, 4), 0.2)
+        light[0, 0, 0], light[0, 3, 1] = 1.0, 0.0
+        repaired = repair_outliers(light, MeasuredNoise(1e-6, 0.0))
+        assert repaired.count == 2
+        assert (repaired.light == 0.2).all()
+
+
+class TestMeasureNoise(BaseTester):
+    @pytest.mark.parametrize("electrons", [300.0, 3000.0, 50_000.0])
+    def test_feature_within_a_tenth_of_the_sensor(self, electrons):
+        light, sensor = capture(electrons)
+        found = measure_noise(light)
+        level = float(light.mean())
+        assert found.std(level) == pytest.approx(float(sensor.std(torch.tensor(level))), rel=0.1)
+
+    def test_feature_too_little_to_measure(self):
+        assert measure_noise(torch.rand(3, 9, 200)) is None
+        assert measure_noise(torch.ones(3, 200, 200)) is None
+
+
+class TestCheckCapture(BaseTester):
+    def test_feature_nothing_to_tell(self):
+        light, sensor = capture()
+        checked = check_capture(light, told(sensor))
+        assert not [note for note in checked.notes if "outliers" not in note]
+
+    def test_feature_noise_that_is_told_too_small(self):
+        light, sensor = capture(1000.0)
+        (note,) = check_capture(light, MeasuredNoise(*(0.04 * part for part in told(sensor)))).notes
+        assert "5 times what is told: give noise=0.0" in note
+        assert not check_capture(light, MeasuredNoise(*(3 * part for part in told(sensor)))).notes
+
+    @pytest.mark.parametrize("quality", [80, 92])
+    def test_feature_jpeg(self, quality):
+        light, sensor = capture()
+        pixels = (linear_rgb_to_rgb(light[None])[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+        read = cv2.imdecode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
+        compressed = rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)[0]
+        assert any("JPEG" in note for note in check_capture(compressed, told(sensor)).notes)
+        assert blockiness(compressed[:, 3:, 5:]) > JPEG > blockiness(light)  # wherever the blocks begin
+
+    def test_feature_encoded_light(self):
+        light, sensor = capture()
+        notes = check_capture(linear_rgb_to_rgb(light[None])[0], told(sensor)).notes
+        assert any("its noise falls with light" in note for note in notes)
+
+    def test_feature_reconstruction_repairs_and_tells(self):
+        optics = TiDyOptics(fidelity="draft", sensor=SensorNoise(2.4 / 20_000, full_well=20_000.0))
+        light, _ = capture(side=128)
+        marked, _ = with_outliers(light, 2e-3)
+        head = LightHead(any_camera_system(optics))
+        clean, found = (reconstruct_light(head, one) for one in (light, marked))
+        (note,) = (note for note in found.notes if "outliers" in note)
+        assert int(note.split()[0]) >= 60
+        assert (found.image - clean.image).square().mean() < 1e-3
+
+    def test_exception_a_camera_without_a_sensor_has_no_noise(self):
+        with pytest.raises(ValueError, match="the camera has no sensor: give sensor="):
+            any_camera_system(TiDyOptics(fidelity="draft", sensor=None))
