@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from kornia_tidy.optics.spectrum import Spectrum
     from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
     from kornia_tidy.psf.psf_bank import PSFBank
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 __all__ = [
     "DefocusRange",
@@ -66,7 +66,7 @@ _MODULES = {
     "optics.spectrum": ("Spectrum",),
     "optics.thin_lens": ("DefocusRange", "ThinLensCamera"),
     "psf.psf_bank": ("PSFBank",),
-    "sensor.noise": ("SensorNoise",),
+    "sensor.sensor": ("SensorNoise",),
 }
 __getattr__ = importer(__name__, _MODULES)
 

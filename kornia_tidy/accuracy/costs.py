@@ -17,8 +17,7 @@ from kornia_tidy.psf.energies import energy_operations
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.dispatch import choose
-from kornia_tidy.render.layers import assign_layers
-from kornia_tidy.render.scene import scene_of_layers
+from kornia_tidy.render.scene import layered_scene
 
 _points = cache(gauss_legendre_order)
 
@@ -91,11 +90,12 @@ def rendering_work(
         True
     """
     dtype = torch.float64 if double else torch.float32
-    index, weight = assign_layers(defocus, torch.tensor(nodes, dtype=defocus.dtype, device=defocus.device), layers)
-    weight = weight.to(dtype) if layers == "linear" else None
     image = torch.zeros((), dtype=dtype, device=defocus.device).expand(batch, channels, *defocus.shape[-2:])
     psfs = image.new_zeros(()).expand(len(nodes), channels, window, window)
-    scene = scene_of_layers(image, index, weight, psfs, None, border, compositing, dtype)
+    at = defocus.new_tensor(list(nodes))
+    if compositing == "gather" and border != "valid":  # what lies beyond the image costs nothing
+        border = "replicate"
+    scene = layered_scene(image, defocus, at, psfs, None, compositing, layers, border)
     # A processor's choice looks at the PSFs' values: of one layer, as all of a wide range would take gigabytes.
     one = replace(scene, psfs=psfs[:1]) if psfs.device.type == "cpu" else scene
     return choose(one).work(scene)

@@ -34,7 +34,7 @@ from torch import Tensor
 
 from kornia_tidy.accuracy.scene_light import SceneLight, interpolation
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_layer_matrix, fine_nodes, guarded
-from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.scene import assign_layers
 
 
 def layer_coefficients(psi: Tensor, nodes: Sequence[float], layers: str, band: float) -> tuple[Tensor, Sequence[float]]:

@@ -18,10 +18,10 @@ from kornia_tidy.accuracy.error_model import change_error
 from kornia_tidy.accuracy.planner import FLOAT32_ERROR, PlannedScene
 from kornia_tidy.accuracy.render_plan import RenderPlan
 from kornia_tidy.psf.geometric_psf import blur_radius
-from kornia_tidy.psf.pieces import pieces_of
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
-from kornia_tidy.render.exposure import Rendering, render_pieces
+from kornia_tidy.render.dispatch import Rendering
+from kornia_tidy.render.pieces import pieces_of, render_pieces
 
 SAFETY = 1.5  # measured errors are up to 1.2 times the formula
 _DEPTHS = 16  # of the scene at which PSFs are compared

@@ -13,7 +13,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.modulator.modulator import DwellTimes, LearnableDwellTimes, Modulator, Timeline, timeline_of
 from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 class DrawnOptics(NamedTuple):

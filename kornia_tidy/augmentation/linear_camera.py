@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.holes import fills_holes
+from kornia_tidy.camera.strips import Strip
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.psf.field import Field
-from kornia_tidy.psf.pieces import pieces_of
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.render.exposure import render_pieces
 
 _WANTED = [True, False, False, False, False]  # of image, defocus, nodes, PSFs and stray light
 
@@ -104,8 +103,8 @@ class LinearCamera(nn.Module):
     def _through_lens(self, light: Tensor) -> Tensor:
         optics, dtype = self.optics, self._dtype(light.dtype)
         defocus = optics.defocus(self.depth.to(dtype))
-        pieces = pieces_of(optics.psf_model, light.shape[1], dtype, defocus, optics.compositing, field=self._field)
-        return render_pieces(light.to(dtype), defocus, pieces, optics.rendering(light.device)).to(light.dtype)
+        strip = Strip(light.to(dtype), defocus, defocus, optics.border, fields=(cast("Field", self._field),))
+        return optics.blurred(strip).to(light.dtype)
 
     def _dtype(self, dtype: torch.dtype) -> torch.dtype:
         return torch.promote_types(dtype, torch.float64 if self.optics.fidelity.double else torch.float32)

@@ -14,7 +14,7 @@ from kornia_tidy.augmentation.ranges import Range, check_probability, checked_ra
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.sensor.steps import quantize, shot_noise
 
 COLOR_SPACES = ("srgb", "linear")

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def burst_shares(shares: Tensor, dead_time: float, exposure: float) -> Tensor:

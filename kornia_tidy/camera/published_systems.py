@@ -24,7 +24,7 @@ from kornia_tidy.modulator.modulator import DiffractionEfficiency, DwellTimes
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.materials import NOA61, PMMA
 from kornia_tidy.optics.published_systems import SITZMANN_PLATE, published_system
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def published_parts(name: str, generator: torch.Generator | None = None, **overrides: Any) -> dict[str, Any]:

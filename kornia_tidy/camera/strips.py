@@ -3,44 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
 from kornia_tidy.psf.field import Field
-from kornia_tidy.render.bands import padded_band
+from kornia_tidy.render.borders import extended
 from kornia_tidy.sensor.sensor import STRIP
 
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Rows of a capture, with the image and the depth that they are seen from.
+    """Rows of a capture, with the light and the defocus that they are seen from.
 
     Args:
-        image: (B, C, H, W) in the camera's colour space, in the type that the capture is computed in.
-        depth: (B, 1, H, W) or (1, 1, H, W).
-        border: what lies beyond the image: ``"valid"`` where it reaches as far as the PSFs.
+        light: (B, C, H, W) linear, in the type that the capture is computed in.
+        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
+        reach: lowest and highest defocus of all rows in radians, (2,), or their map.
+        border: what lies beyond the light: ``"valid"`` where it reaches as far as the PSFs.
         rows: of the capture. Default: all.
-        reach: lowest and highest defocus of all rows, (2,). Default: to be found.
-        fields: of the whole picture, behind a real lens, and where in it this image begins: one, or one for each image.
+        fields: of the whole picture, behind a real lens, and where in it the light begins: one, or one for each image.
     """
 
-    image: Tensor
-    depth: Tensor
+    light: Tensor
+    defocus: Tensor
+    reach: Tensor
     border: str
     rows: slice | None = None
-    reach: Tensor | None = None
     fields: tuple[Field, ...] = ()
 
-    def by_field(self) -> dict[Field | None, list[int]]:
-        """Return the images of the batch that lie at each place of the field; none of them: all."""
-        if len(self.fields) < 2:
-            return {self.fields[0] if self.fields else None: []}
-        places: dict[Field | None, list[int]] = {}
+    def images(self) -> Iterator[Strip]:
+        """Yield the images of the batch one by one, each at its place of the field."""
         for i, field in enumerate(self.fields):
-            places.setdefault(field, []).append(i)
-        return places if len(places) > 1 else {self.fields[0]: []}
+            light, defocus = (x[i : i + 1] if len(x) > 1 else x for x in (self.light, self.defocus))
+            yield replace(self, light=light, defocus=defocus, fields=(field,))
 
 
 def rows_at_once(sample: Sample, allowed: int) -> int | None:
@@ -59,9 +56,9 @@ def rows_at_once(sample: Sample, allowed: int) -> int | None:
 
 
 def strips_of(
-    sample: Sample, rows: int, height: int, radius: int, border: str, reach: Tensor, fields: tuple[Field, ...]
-) -> Iterator[Strip]:
-    """Yield the strips of a capture.
+    sample: Sample, rows: int, height: int, radius: int, border: str, fields: tuple[Field, ...]
+) -> Iterator[tuple[slice, Tensor, Tensor, tuple[Field, ...]]]:
+    """Yield the rows of each strip of a capture, the image and the depth that they are seen from, and their fields.
 
     Args:
         sample: image and depth.
@@ -69,17 +66,17 @@ def strips_of(
         height: of the capture.
         radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
         border: of the capture.
-        reach: lowest and highest defocus, (2,).
         fields: of the pictures, behind a real lens.
     """
     sides = "replicate" if border == "zero" else border  # black has no depth of its own
+    before = 0 if border == "valid" else radius
+    columns = -before, sample.image.shape[-1] + before
     for top in range(0, height, rows):
         own = slice(top, min(top + rows, height))
-        image = padded_band(sample.image, own, radius, border).to(sample.dtype)
-        depth = padded_band(sample.depth, own, radius, sides).to(sample.dtype)
-        before = 0 if border == "valid" else radius
-        places = tuple(field.moved(top - before, -before) for field in fields)
-        yield Strip(image, depth, "valid", own, reach, places)
+        seen = top - before, own.stop - before + 2 * radius
+        image = extended(sample.image, seen, columns, border).to(sample.dtype)
+        depth = extended(sample.depth, seen, columns, sides).to(sample.dtype)
+        yield own, image, depth, tuple(field.moved(top - before, -before) for field in fields)
 
 
 def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
@@ -34,18 +34,18 @@ from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.psf.field import check_center
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
-from kornia_tidy.psf.pieces import comes_in_pieces, pieces_of
 from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf.wide_psfs import held_nodes
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
-from kornia_tidy.render.dispatch import Explanation, explain
-from kornia_tidy.render.exposure import Rendering, render_pieces
+from kornia_tidy.render.dispatch import Explanation, Rendering, explain
+from kornia_tidy.render.pieces import comes_in_pieces, pieces_of, render_pieces
 from kornia_tidy.render.scene import layered_scene
-from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.sensor.sensor import Sensor, check_sensor
+from kornia_tidy.sensor.sensor import Sensor, SensorNoise, check_sensor
 
 if TYPE_CHECKING:
     from kornia_tidy.accuracy.render_plan import RenderPlan
+    from kornia_tidy.psf.wide_blur import WideBlur
 
 _DEFAULT_SENSOR = SensorNoise(0.01)
 
@@ -238,35 +238,26 @@ class TiDyOptics(CameraState):
         device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             for strip in self.strips(sample):  # one, of the whole picture, unless memory is short
-                light, defocus = self.decode(strip.image), self.defocus(strip.depth)
-                irradiance = self.blurred(light, defocus, strip)
+                irradiance = self.blurred(strip)
                 seen = self.encode(self.expose(irradiance, params, generator, strip.rows)).to(dtype)
                 coded = seen if strip.rows is None else placed(coded, seen, strip.rows, self.height(sample))
             return sample.coded(cast("Tensor", coded))
 
-    def blurred(self, light: Tensor, defocus: Tensor, strip: Strip) -> Tensor:
-        """Return the irradiance on the sensor over the whole exposure: a sum over the pieces of the PSFs.
+    def blurred(self, strip: Strip) -> Tensor:
+        """Return the irradiance on the sensor over the whole exposure, (B, C, h, w): a sum over pieces of the PSFs.
 
         Args:
-            light: (B, C, H, W) linear light.
-            defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-            strip: that they are of.
+            strip: of a picture.
         """
-        if (reach := strip.reach) is None:
-            scene = strip.image, strip.depth, defocus
-            reach = (
-                defocus_extremes_in_one_read(*scene, self)
-                if Mode.UNREAD in torch_mode()
-                else defocus_extremes([defocus], self)
-            )
+        if len(set(strip.fields)) > 1:
+            return torch.cat([self.blurred(image) for image in strip.images()])
+        light, defocus, fidelity = strip.light, strip.defocus, self.psf_model.fidelity
         given = self.compositing, self.memory_budget, defocus, light.device
-        parts, order = [], []
-        for field, items in strip.by_field().items():
-            own, deep = (light[items], defocus[items] if len(defocus) > 1 else defocus) if items else (light, defocus)
-            pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, reach, *given, field)
-            parts.append(render_pieces(own, deep, pieces, self.rendering(light.device, strip.border)))
-            order += items
-        return torch.cat(parts)[torch.tensor(order).argsort().to(light.device)] if order else parts[0]
+        field = strip.fields[0] if strip.fields else None
+        pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, strip.reach, *given, field)
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        rendering = Rendering(self.compositing, strip.border, layers, fidelity.correlate)
+        return render_pieces(light, defocus, pieces, rendering)
 
     def strips(self, sample: Sample) -> Iterator[Strip]:
         """Yield the strips that a picture is taken in: ordinarily one, which is all of it.
@@ -276,37 +267,41 @@ class TiDyOptics(CameraState):
         """
         rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
         size = sample.image.shape[-2], sample.image.shape[-1]
-        found = [self.psf_model.field_of(size, center) for center in sample.centers or (self.field_center,)]
+        centers = () if self.lens is None else sample.centers or (self.field_center,)
+        found = [self.psf_model.field_of(size, center) for center in centers]
         fields = tuple(field for field in found if field is not None)
         if rows is None:
-            yield Strip(sample.image.to(sample.dtype), sample.depth.to(sample.dtype), self.border, fields=fields)
+            image, depth = sample.image.to(sample.dtype), sample.depth.to(sample.dtype)
+            light, defocus = self.decode(image), self.defocus(depth)
+            unread = Mode.UNREAD in torch_mode()
+            reach = (
+                defocus_extremes_in_one_read(image, depth, defocus, self)
+                if unread
+                else defocus_extremes([defocus], self)
+            )
+            yield Strip(light, defocus, reach, self.border, fields=fields)
             return
-        check_border(self.border, *sample.image.shape[-2:], self.window)
+        check_border(self.border, *size, self.window)
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
         reach = defocus_extremes((self.defocus(part.to(sample.dtype)) for part in parts), self)
-        yield from strips_of(sample, rows, self.height(sample), self.window // 2, self.border, reach, fields)
+        given = rows, self.height(sample), self.window // 2, self.border, fields
+        for own, image, depth, places in strips_of(sample, *given):
+            yield Strip(self.decode(image), self.defocus(depth), reach, "valid", own, places)
 
     def irradiance(self, sample: Sample) -> Tensor:
         """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""
         whole, device = None, sample.image.device
         with torch.autocast(device.type, enabled=False), values_unread(device):
             for strip in self.strips(sample):
-                part = self.blurred(self.decode(strip.image), self.defocus(strip.depth), strip)
+                part = self.blurred(strip)
                 whole = part if strip.rows is None else placed(whole, part, strip.rows, self.height(sample))
         return cast("Tensor", whole)
 
     def height(self, sample: Sample) -> int:
         """Return how many rows a capture has."""
         return sample.image.shape[-2] - (self.window - 1 if self.border == "valid" else 0)
-
-    def rendering(self, device: torch.device, border: str | None = None) -> Rendering:
-        """Return how pieces of PSFs are rendered on a device, with another border than the camera's if it is given."""
-        fidelity, waits = self.psf_model.fidelity, self.fixed_defocus is None or device.type == "cpu"
-        layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        given = self.compositing, border or self.border, layers, fidelity.correlate
-        return Rendering(*given, "auto" if waits else "batched")
 
     def _rows_at_once(self, sample: Sample) -> int | None:
         """Return how many rows fit the memory allowed; None where all do, or the whole image is needed at once."""
@@ -446,13 +441,14 @@ class TiDyOptics(CameraState):
         given = self.compositing, self.memory_budget, defocus
         pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
         if pieces[0].window is not None:
-            groups = ", ".join(f"{len(piece.bank().defocus)} on grids of {piece.grid} px" for piece in pieces)
+            held = held_nodes(cast("WideBlur", self.psf_model.wide_blur), defocus)
+            groups = ", ".join(f"{len(nodes)} on grids of {group.grid} px" for group, nodes in held)
             words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
             return Explanation(words, "grids", {}, {})
-        bank, how = pieces[0].bank(), asdict(self.rendering(light.device))
-        del how["method"]
+        bank, fidelity = pieces[0].bank(), self.psf_model.fidelity
         light = light.repeat(1, bank.psfs.shape[1] // channels, 1, 1)
-        found = explain(layered_scene(light, defocus, bank.defocus, bank.psfs, bank.veil, **how))
+        how = self.compositing, "nearest" if fidelity.layers == "nearest" else "linear", self.border, fidelity.correlate
+        found = explain(layered_scene(light, defocus, bank.defocus, bank.psfs, bank.veil, *how))
         return found if len(pieces) == 1 else replace(found, scene=f"{found.scene}, the first of {len(pieces)} pieces")
 
     # ------------------------------------------------------------------ training, data sets, people

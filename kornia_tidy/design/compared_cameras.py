@@ -26,7 +26,7 @@ from kornia_tidy.reconstruction.tasks import depth_logits, split_maps
 from kornia_tidy.reconstruction.trained import any_camera_system
 from kornia_tidy.reconstruction.wiener import Wiener
 from kornia_tidy.sensor.exposure import exposed_sensor
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 REFERENCE_F_NUMBER = DesignSettings.reference_f_number  # at which electrons are counted
 BILATERAL = (7, 0.14, (2.0, 2.0))  # px, difference of encoded colours, px

@@ -18,7 +18,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
 _PER_FOCAL_LENGTH = 1.22 * 2  # Airy disc: diameter / (wavelength * f-number)

@@ -22,7 +22,7 @@ from kornia_tidy.masks.base import PhaseMasks, adam_groups
 from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def design(

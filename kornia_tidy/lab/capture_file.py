@@ -17,7 +17,7 @@ from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.develop import develop
 from kornia_tidy.lab.raw.developed_noise import developed_noise
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 PICTURES = (
     ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp",

@@ -22,7 +22,7 @@ from kornia_tidy.reconstruction.refocused import Refocused
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tiled import shared_copy
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, fix_window, update_psfs
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 DEFOCUS_BEYOND = 2.0  # rad; a network may be for depths that the measured PSFs miss by so little
 SAME_LENS = 0.05  # relative difference of lengths; a lens that is built differs from its design

@@ -25,7 +25,7 @@ from kornia_tidy.reconstruction.tasks import MAPS, depth_logits, deviation_in_me
 from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
 from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.reconstruction.whole_picture import whole_picture
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 FIELD_TILE = 384  # px, within which the PSFs of its middle serve; each tile costs a computation of kernels
 

@@ -35,7 +35,7 @@ from kornia_tidy.settings import (
 
 if TYPE_CHECKING:
     from kornia_tidy.optics.thin_lens import ThinLensCamera
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 MOST = 1024  # masks, their pixels along a side, blocks, or depths to refocus to: more would take days
 RENAMED = {"focus": "focus_distance"}  # in checkpoints of earlier versions
@@ -256,7 +256,7 @@ class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSetting
 
     def sensor(self) -> SensorNoise:
         """Return the sensor with its noise."""
-        from kornia_tidy.sensor.noise import SensorNoise  # noqa: PLC0415 (torch takes seconds)
+        from kornia_tidy.sensor.sensor import SensorNoise  # noqa: PLC0415 (torch takes seconds)
 
         return SensorNoise(self.sigma, full_well=self.full_well, bits=self.bits)
 

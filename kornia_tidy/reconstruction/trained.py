@@ -32,7 +32,7 @@ from kornia_tidy.reconstruction.residual import Residual
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import WHAT, read_state
 from kornia_tidy.reconstruction.tasks import channels_of
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.tensor_files import read_tensors
 
 MOST_PSFS = 1 << 27  # bytes; a small file could name a window that takes gigabytes

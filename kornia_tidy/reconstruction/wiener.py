@@ -17,7 +17,7 @@ from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
 from kornia_tidy.reconstruction.tikhonov import BORDERS, Inversion, transfer_function
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def wiener(

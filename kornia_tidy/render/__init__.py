@@ -7,8 +7,8 @@ An image in linear light, its defocus and a PSF bank come in; the irradiance on 
 
 from kornia_tidy.render.compositing import gather, occlusion, render, scatter
 from kornia_tidy.render.dispatch import explain
-from kornia_tidy.render.layers import assign_layers, layer_weights
-from kornia_tidy.render.scene import layered_scene
+from kornia_tidy.render.layers import layer_weights
+from kornia_tidy.render.scene import assign_layers, layered_scene
 
 __all__ = [
     "assign_layers",

@@ -15,7 +15,7 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.kernels.window_sides import next_fast_size
 
 BORDERS = ("reflect", "replicate", "zero", "circular", "valid")
-_PAD_MODES = {"reflect": "reflect", "replicate": "replicate", "zero": "constant", "circular": "circular"}
+PAD_MODES = {"reflect": "reflect", "replicate": "replicate", "zero": "constant", "circular": "circular"}
 
 
 def check_border(border: str, height: int, width: int, psf_size: int) -> None:
@@ -51,7 +51,7 @@ def pad_border(image: Tensor, radius: int | tuple[int, int], border: str) -> Ten
     if border == "valid":
         return image
     across, down = (radius, radius) if isinstance(radius, int) else radius
-    return torch.nn.functional.pad(image, (across, across, down, down), mode=_PAD_MODES[border])
+    return torch.nn.functional.pad(image, (across, across, down, down), mode=PAD_MODES[border])
 
 
 def extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], border: str) -> Tensor:

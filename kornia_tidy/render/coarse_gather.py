@@ -28,23 +28,26 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
-from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.render.borders import cropped, extended, next_fast_size
 from kornia_tidy.render.compositing import Bank, gather
-from kornia_tidy.render.layers import assign_layers
+from kornia_tidy.render.scene import assign_layers
 
 _SHARPENED = 1 / 6  # half of the variance that averaging and interpolating add on each axis
 _LAYER_BYTES = 64 << 20  # of the layers held at a time
 
 
-def gather_group(image: Tensor, defocus: Tensor, group: Piece, border: str = "reflect") -> Tensor:
+def gather_group(
+    image: Tensor, defocus: Tensor, bank: Bank, own: Tensor, grid: int, margin: int = 0, border: str = "reflect"
+) -> Tensor:
     """Gather light through a group of layers on one grid, at the pixels that are the group's.
 
     Args:
         image: (B, C, H, W) linear light.
         defocus: (B, 1, H, W) or (1, 1, H, W) radians. Beyond the group's layers it is clamped to the ends.
-        group: PSFs, the span of defocus whose pixels it takes, and its grid; with ``window`` set, by half of which the
-            border ``"valid"`` crops.
+        bank: PSFs of the group.
+        own: which pixels are the group's, bool, as ``defocus``.
+        grid: sensor pixels along a side of a pixel of the PSFs.
+        margin: pixels that are not seen on each side.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Images smaller than a PSF's radius
             are reflected several times.
 
@@ -54,16 +57,15 @@ def gather_group(image: Tensor, defocus: Tensor, group: Piece, border: str = "re
     Example:
         >>> from kornia_tidy.psf import PSFBank
         >>> bank = PSFBank(torch.full((2, 1, 5, 5), 1 / 25), torch.tensor([8.0, 9.0]), torch.ones(2, 1))
-        >>> group = Piece(lambda: bank, grid=2, window=11)
-        >>> gather_group(torch.ones(1, 1, 16, 16), torch.full((1, 1, 16, 16), 8.2), group).mean().round()
+        >>> defocus = torch.full((1, 1, 16, 16), 8.2)
+        >>> gather_group(torch.ones(1, 1, 16, 16), defocus, bank, defocus > 8, grid=2).mean().round()
         tensor(1.)
     """
-    margin = (group.window or 0) // 2 if border == "valid" else 0
-    seen, own = cropped(defocus, margin), cropped(group.holds(defocus), margin)
-    if group.grid == 1:
-        return torch.where(own, _on_sensor(image, seen, group.bank(), margin, border), 0)
+    seen, own = cropped(defocus, margin), cropped(own, margin)
+    if grid == 1:
+        return torch.where(own, _on_sensor(image, seen, bank, margin, border), 0)
     coded = image.new_zeros(*image.shape[:2], *seen.shape[-2:])
-    for b, pixels, light in _on_grid(image, seen, own, group, margin, border):
+    for b, pixels, light in _on_grid(image, seen, own, bank, grid, margin, border):
         coded.flatten(2)[b].index_copy_(1, pixels, light.to(image.dtype))
     return coded
 
@@ -79,10 +81,9 @@ def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str
 
 
 def _on_grid(
-    image: Tensor, seen: Tensor, own: Tensor, group: Piece, margin: int, border: str
+    image: Tensor, seen: Tensor, own: Tensor, bank: Bank, grid: int, margin: int, border: str
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield images of the batch, pixels (n,) of the group and their light (C, n), some layers at a time."""
-    bank, grid = group.bank(), group.grid
     radius = bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening
     rows, columns = ((margin - radius * grid, margin + (-(-side // grid) + radius) * grid) for side in seen.shape[-2:])
     plane = avg_pool2d(extended(image, rows, columns, border), grid)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from torch import Tensor
 
-from kornia_tidy.render.render_ops import render_layers
+from kornia_tidy.render.dispatch import render_layers
 
 
 class Bank(Protocol):

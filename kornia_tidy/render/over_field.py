@@ -29,8 +29,9 @@ from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.render.backends.dense_occlusion import cumulative_weight, lay_over
 from kornia_tidy.render.borders import check_border, cropped, from_spectrum, pad_border, to_spectrum
-from kornia_tidy.render.layers import assign_layers, present_layers, weight_of_layer
-from kornia_tidy.render.render_ops import Rendering, render_layers
+from kornia_tidy.render.dispatch import Rendering, render_layers
+from kornia_tidy.render.layers import present_layers, weight_of_layer
+from kornia_tidy.render.scene import assign_layers
 from kornia_tidy.render.stray_light import spread_evenly
 
 
@@ -85,7 +86,7 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
 def _is_compiled(light: Tensor, bank: FieldBank, rendering: Rendering) -> bool:
     """Return whether the compiled backend takes PSFs over the field: for occlusion and elsewhere cells are rendered."""
     dtype = torch.promote_types(torch.promote_types(light.dtype, bank.psfs.dtype), torch.float32)
-    if rendering.compositing == "occlusion" or rendering.method not in ("auto", "compiled") or torch_mode():
+    if rendering.compositing == "occlusion" or torch_mode():
         return False
     return light.device.type == "cpu" and compiled(SOURCE, dtype) is not None
 

@@ -1,4 +1,9 @@
-"""The layered scene: the renderer's input, checked, with every pixel assigned to its layers."""
+"""The layered scene: the renderer's input, checked, with every pixel assigned to its defocus layers.
+
+A bank knows its PSFs at a few nodes of defocus. A pixel between two nodes has a layer index, that of the node below it,
+and a layer weight, the fraction of the way to the next node. All weights follow from these two numbers, so no
+(B, D, H, W) tensor is needed.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.overlap_ops import Places, window_size
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
-from kornia_tidy.render.borders import BORDERS, check_border, pad_border, padded_size
-from kornia_tidy.render.layers import assign_layers, check_nodes
+from kornia_tidy.render.borders import BORDERS, PAD_MODES, check_border, pad_border, padded_size
 
+LAYER_MODES = ("nearest", "linear")
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
 
 
@@ -23,7 +30,7 @@ class Labels:
     """The layers of each pixel: all light to one layer, or a weight to the next one.
 
     Args:
-        layer_index: (B, H, W) int64 index of a layer, from :func:`~kornia_tidy.render.layers.assign_layers`.
+        layer_index: (B, H, W) int64 index of a layer, from :func:`assign_layers`.
         layer_weight: (B, H, W) weight of the next layer, or None for nearest layers.
         weight_gradient: a layer with a weight of zero counts too, for its gradient.
     """
@@ -31,13 +38,6 @@ class Labels:
     layer_index: Tensor
     layer_weight: Tensor | None
     weight_gradient: bool = False
-
-    @classmethod
-    def of(cls, layer_index: Tensor, layer_weight: Tensor | None) -> Labels:
-        """Return labels for layers as assigned; ``weight_gradient`` where a gradient of ``layer_weight`` is wanted."""
-        if layer_weight is None:
-            return cls(layer_index, None)
-        return cls(layer_index, layer_weight.detach(), layer_weight.requires_grad and torch.is_grad_enabled())
 
     def every(self, step: int) -> Labels:
         """Return the labels of every ``step``-th row and column."""
@@ -106,7 +106,8 @@ class LayeredScene:
     def plane(self) -> Tensor:
         """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels. Made on first use."""
         if "plane" not in self.found:
-            self.found["plane"] = pad_border(self.image, self.psfs.shape[-1] // 2, self.border)
+            margin, image = (self.psfs.shape[-1] // 2,) * 4, self.image
+            self.found["plane"] = image if self.border == "valid" else pad(image, margin, PAD_MODES[self.border])
         return self.found["plane"]
 
     @property
@@ -147,11 +148,11 @@ def layered_scene(
     nodes: Tensor,
     psfs: Tensor,
     stray_light: Tensor | None = None,
-    *,
     compositing: str = "gather",
     layers: str = "linear",
     border: str = "reflect",
     correlate: bool = False,
+    field: Field | None = None,
 ) -> LayeredScene:
     """Check a scene and assign its pixels to layers, for :func:`kornia_tidy.render.dispatch.choose`.
 
@@ -159,12 +160,13 @@ def layered_scene(
         image: (B, C, H, W) linear light.
         defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians.
         nodes: (D,) ascending defocus of the layers in radians.
-        psfs: (D, C, P, P) with P odd.
+        psfs: (D, C, P, P) with P odd; with a field (F, D, C, P, P).
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        layers: ``"linear"`` or ``"nearest"``, see :func:`kornia_tidy.render.layers.assign_layers`.
+        layers: ``"linear"`` or ``"nearest"``, see :func:`assign_layers`.
         border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
         correlate: flip the PSFs by 180 degrees.
+        field: where over the picture PSFs are known. Default: they are the same everywhere.
 
     Returns:
         The scene in float32 or better.
@@ -180,68 +182,14 @@ def layered_scene(
         >>> scene.output_size, scene.layer_index.unique(), scene.layer_weight.unique()
         ((4, 4), tensor([0]), tensor([0.5000]))
     """
-    check_scene(image, defocus, nodes, psfs, stray_light, border)
-    if nodes.device.type != "cpu":
-        check_nodes(nodes)
-    return assigned_scene(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate)
-
-
-def assigned_scene(
-    image: Tensor,
-    defocus: Tensor,
-    nodes: Tensor,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    compositing: str,
-    layers: str,
-    border: str,
-    correlate: bool,
-    field: Field | None = None,
-) -> LayeredScene:
-    """Return the scene of :func:`layered_scene`, whose tensors were checked before."""
-    dtype = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
-    index, weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
-    return scene_of_layers(
-        image.to(dtype),
-        index,
-        weight.to(dtype) if layers == "linear" else None,
-        (psfs.flip((-2, -1)) if correlate else psfs).to(dtype),
-        None if stray_light is None else stray_light.to(dtype),
-        border,
-        compositing,
-        image.dtype,
-        field,
-    )
-
-
-def scene_of_layers(
-    image: Tensor,
-    layer_index: Tensor,
-    layer_weight: Tensor | None,
-    psfs: Tensor,
-    stray_light: Tensor | None,
-    border: str,
-    compositing: str,
-    dtype: torch.dtype,
-    field: Field | None = None,
-) -> LayeredScene:
-    """Return a scene with layers that the caller knows already. Nothing is checked.
-
-    Args:
-        image: this and the other arguments are those of :class:`LayeredScene`.
-        layer_index: of each pixel.
-        layer_weight: of the next layer, or None.
-        psfs: of the layers.
-        stray_light: of the layers, or None.
-        border: what lies beyond the image.
-        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        dtype: of the rendered image.
-        field: where over the picture PSFs are known.
-    """
+    check_scene(image, defocus, nodes, psfs if field is None else psfs[0], stray_light, border)
+    kind = torch.promote_types(torch.promote_types(image.dtype, psfs.dtype), torch.float32)
+    layer_index, layer_weight = assign_layers(defocus, nodes, layers)  # in defocus's own precision, not in the image's
+    layer_weight = layer_weight.to(kind) if layers == "linear" else None
     index, weight, radius, batch = layer_index, layer_weight, psfs.shape[-1] // 2, len(image)
     if compositing != "gather":
         sides = "replicate" if border == "zero" else border
-        index = pad_border(index.to(image.dtype), radius, sides).long()  # padding is for real numbers
+        index = pad_border(index.to(kind), radius, sides).long()  # padding is for real numbers
         weight = None if weight is None else pad_border(weight, radius, sides)
     elif border == "valid" and radius > 0:
         index = index[..., radius:-radius, radius:-radius]
@@ -249,11 +197,89 @@ def scene_of_layers(
     index, weight = index[:, 0], None if weight is None else weight[:, 0]
     with_gradient = weight is not None and weight.requires_grad and torch.is_grad_enabled()
     of_batch = None if weight is None else weight.detach().expand(batch, -1, -1)
-    labels = Labels(index.expand(batch, -1, -1), of_batch, with_gradient)
-    sorted_layers = index, weight
     return LayeredScene(
-        image, layer_index, layer_weight, psfs, stray_light, border, compositing, dtype, sorted_layers, labels, field
+        image.to(kind),
+        layer_index,
+        layer_weight,
+        (psfs.flip((-2, -1)) if correlate else psfs).to(kind),
+        None if stray_light is None else stray_light.to(kind),
+        border,
+        compositing,
+        image.dtype,
+        (index, weight),
+        Labels(index.expand(batch, -1, -1), of_batch, with_gradient),
+        field,
     )
+
+
+def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Tensor]:
+    r"""Return the layer below each pixel's defocus and the weight of the next layer.
+
+    .. math:: t = \frac{\psi - \psi_i}{\psi_{i+1} - \psi_i}, \qquad \psi_i \le \psi \le \psi_{i+1}
+
+    Args:
+        defocus: (B, 1, H, W) defocus in radians. Values beyond the nodes are clamped to the end nodes.
+        nodes: (D,) defocus of the layers in radians, strictly ascending; the spacing may vary.
+        mode: ``"linear"`` shares the light between two layers, ``"nearest"`` gives all of it to one.
+
+    Returns:
+        The layer index i in int64 and the layer weight t in [0, 1], both (B, 1, H, W). Layer i has the weight 1 - t and
+        layer i + 1 the weight t. For ``"nearest"`` t is zero.
+
+    Raises:
+        ValueError: if ``mode`` is not known, or the nodes do not ascend (not checked while compiling, nor on an
+            accelerator: see :func:`check_nodes`).
+
+    Convention:
+        - Half way between two nodes, nearest takes the lower one (the farther from the camera).
+        - Linear has a gradient with respect to defocus; on a node it is that of the interval above, on the last node
+          that of the interval below. Nearest has none.
+
+    Example:
+        >>> import torch
+        >>> defocus = torch.tensor([-4.0, 0.5, 3.0, 9.0]).view(1, 1, 1, 4)
+        >>> index, weight = assign_layers(defocus, torch.tensor([-2.0, 0.0, 4.0]), "linear")
+        >>> index.flatten().tolist(), weight.flatten().tolist()
+        ([0, 1, 1, 1], [0.0, 0.125, 0.75, 1.0])
+    """
+    if mode not in LAYER_MODES:
+        check_choice("layers", mode, LAYER_MODES)
+    check_float_tensor("nodes", nodes, 1, "(D,)")
+    dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
+    defocus, nodes = defocus.to(dtype), nodes.to(dtype)
+    even, spacing = False, nodes.new_ones(())
+    if nodes.device.type == "cpu" and len(nodes) > 1 and not (nodes.requires_grad or Mode.TRANSFORM in torch_mode()):
+        # Between evenly spaced nodes there is nothing to search, which takes ten times as long.
+        spacing, rounding = (nodes[-1] - nodes[0]) / (len(nodes) - 1), 4 * torch.finfo(dtype).eps * nodes.abs().max()
+        apart = (nodes - (nodes[0] + spacing * torch.arange(len(nodes), dtype=dtype))).abs()
+        even = bool(((apart <= rounding) & (spacing > 2 * rounding)).all())
+    if nodes.device.type == "cpu" and not even:
+        check_nodes(nodes)
+    if mode == "nearest" and even:
+        steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
+        return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
+    if mode == "nearest" or len(nodes) == 1:
+        middles = (nodes[1:] + nodes[:-1]) / 2
+        index = torch.bucketize(defocus.detach().contiguous(), middles.detach())
+        return index, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
+    if even:
+        steps = (defocus - nodes[0]).div_(spacing).clamp_(0, len(nodes) - 1)
+        index = steps.detach().long().clamp_(max=len(nodes) - 2)
+        return index, steps - index
+    clamped = defocus.clamp(nodes[0], nodes[-1])
+    # Inner nodes only: the end nodes belong to the first and last interval.
+    index = torch.bucketize(clamped.detach().contiguous(), nodes[1:-1].detach().contiguous(), right=True)
+    return index, (clamped - nodes.take(index)) / nodes.diff().take(index)
+
+
+def check_nodes(nodes: Tensor) -> None:
+    """Raise ``ValueError`` if the nodes do not ascend strictly, unless their values are unknown. Waits for the device.
+
+    Args:
+        nodes: (D,) defocus of the layers in radians.
+    """
+    if Mode.GRAPH not in torch_mode() and not bool((nodes.diff() > 0).all()):
+        raise ValueError(f"nodes must ascend strictly, got {nodes.tolist()}")
 
 
 def check_scene(

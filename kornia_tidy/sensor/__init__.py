@@ -1,14 +1,13 @@
 """Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
 
 A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
-``noise.py`` first; ``sensor.py`` has the base of your own sensors, ``steps.py`` single steps, ``fixed_pattern.py`` the
-differences between pixels, ``exposure.py`` the light that an f-number admits.
+``sensor.py`` first; ``steps.py`` has single steps, ``fixed_pattern.py`` the differences between pixels,
+``exposure.py`` the light that an f-number admits.
 """
 
 from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor, full_well_of
 from kornia_tidy.sensor.fixed_pattern import draw_pattern
-from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.sensor.sensor import Sensor
+from kornia_tidy.sensor.sensor import Sensor, SensorNoise
 from kornia_tidy.sensor.steps import quantize, shot_noise
 
 __all__ = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 # Electrons for each square metre of a pixel: 10,500 on 3.45 um pixels, as the EMVA 1288 data sheets of cameras with a
 # Sony IMX250 have, and the 57,000 on 8 um of the default design. Back-illuminated sensors hold two to three times that.

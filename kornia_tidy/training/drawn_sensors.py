@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.sensor.noise import SensorNoise
-from kornia_tidy.sensor.sensor import Sensor
+from kornia_tidy.sensor.sensor import Sensor, SensorNoise
 
 
 class SensorEach(Sensor):

@@ -33,7 +33,7 @@ from kornia_tidy.reconstruction.trained import (
     update_psfs,
 )
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.drawn_sensors import SensorEach, with_sensor

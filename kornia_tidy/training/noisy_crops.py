@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
 from kornia_tidy.sensor.exposure import electrons_at
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 
 GAIN = (0.5, 2.0)  # range of the exposure factor, uniform in its logarithm

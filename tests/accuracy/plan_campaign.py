@@ -43,9 +43,9 @@ from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, SpatialLigh
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
+from kornia_tidy.render.pieces import Piece
 from kornia_tidy.render.stray_light import spread_evenly
 from tests.accuracy.adversarial_scenes import BORDERS, COMPOSITINGS, SCENES
 from tests.accuracy.planning_rig import Rig, smooth

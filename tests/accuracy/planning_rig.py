@@ -10,8 +10,7 @@ from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.accuracy.planner import Planner
-from kornia_tidy.psf.pieces import pieces_of
-from kornia_tidy.render.exposure import render_pieces
+from kornia_tidy.camera.strips import Strip
 from tests.scenes import load_scene
 
 
@@ -32,8 +31,7 @@ class Rig:
         dtype = torch.float64 if fidelity.double else torch.float32
         light, defocus = light.to(dtype), defocus.to(dtype)
         camera = self._cameras[key]
-        pieces = pieces_of(camera.psf_model, light.shape[1], dtype, defocus, camera.compositing)
-        return render_pieces(light, defocus, pieces, camera.rendering(light.device)).double()
+        return camera.blurred(Strip(light, defocus, defocus, camera.border)).double()
 
     def error(self, light: Tensor, defocus: Tensor, fidelity: Fidelity, reference: Fidelity) -> float:
         """Return the root mean square difference of two captures, full scale 1 also where light goes beyond it.

@@ -24,7 +24,7 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tikhonov import tikhonov
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
 
 CAMERA, SPECTRUM = ThinLensCamera(), Spectrum.rgb()

@@ -7,7 +7,7 @@ import torch
 
 from kornia_tidy import PSFBank
 from kornia_tidy.render import assign_layers, render
-from kornia_tidy.render.layers import LAYER_MODES
+from kornia_tidy.render.scene import LAYER_MODES
 
 
 def run(bench, size, device, compositing="gather", layers=21, mode="linear", window=23, gradients=False):

@@ -9,9 +9,9 @@ from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.optics.aperture import annular_aperture, polygon_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pieces import pieces_of
 from kornia_tidy.render.compositing import gather
-from kornia_tidy.render.exposure import Rendering, render_pieces
+from kornia_tidy.render.dispatch import Rendering
+from kornia_tidy.render.pieces import pieces_of, render_pieces
 from tests.base import BaseTester
 from tests.render.test_coarse_gather import light
 

@@ -17,7 +17,7 @@ from kornia_tidy.design import Candidate, DesignTask, Effort, co_design, planned
 from kornia_tidy.design.design_memory import DesignMemory
 from kornia_tidy.design.design_report import CAMERA, DATA, MASKS, REPORT, design_files
 from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
 
 module = importlib.import_module("kornia_tidy.design.co_design")  # the package has a function of this name

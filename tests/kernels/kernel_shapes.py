@@ -32,7 +32,7 @@ from kornia_tidy.render.backends.dense_occlusion import (
 )
 from kornia_tidy.render.borders import BORDERS, pad_border
 from kornia_tidy.render.layers import weight_of_layer
-from kornia_tidy.render.scene import LayeredScene, scene_of_layers
+from kornia_tidy.render.scene import LayeredScene, layered_scene
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies_tester import gradient_round_off, round_off, written_out
 from tests.rounding import gamma
@@ -305,8 +305,11 @@ def _occluding(draw: random.Random) -> tuple[tuple[Any, ...], LayeredScene, str,
     inside = pad_border(torch.ones(1, 1, height, width, dtype=dtype), radius, border)[0] if border == "zero" else None
     mean = None if veil is None else image.mean((-2, -1))
     seen = None if veil is None else normalised_share(veil, psfs, image.shape[-2:], border)
-    shared = None if fraction is None else fraction[:, None]
-    scene = scene_of_layers(image, lower[:, None], shared, psfs, veil, border, "occlusion", dtype)
+    at, mode = lower[:, None].double(), "nearest"
+    if fraction is not None:
+        at, mode = at + fraction[:, None], "linear"
+    nodes = torch.arange(layers, dtype=torch.float64)
+    scene = layered_scene(image, at, nodes, psfs, veil, "occlusion", mode, border)
     return (plane, psfs, below, share, mean, seen, inside), scene, about, products
 
 

@@ -26,7 +26,7 @@ from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import channels_of
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, update_psfs
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
 
 

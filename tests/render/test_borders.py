@@ -3,9 +3,11 @@ from __future__ import annotations
 import cv2
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.fft import next_fast_len
 
-from kornia_tidy.render.borders import BORDERS, check_border, next_fast_size, pad_border, padded_size
+from kornia_tidy.render.borders import BORDERS, check_border, extended, next_fast_size, pad_border, padded_size
 from tests.base import BaseTester
 
 
@@ -31,6 +33,18 @@ class TestPadBorder(BaseTester):
         padded = pad_border(image, 4, border)
         assert torch.equal(padded[0, 0].double().cpu(), torch.from_numpy(expected))
         assert padded.shape[-2:] == padded_size(5, 7, 9, border)
+
+    @given(data=st.data())
+    @settings(max_examples=100)
+    def test_property_rows_of_the_extended_image_are_those_of_the_padded_one(self, data):
+        radius, border = data.draw(st.integers(0, 4)), data.draw(st.sampled_from(BORDERS[:-1]))
+        height, width = (data.draw(st.integers(2 * radius + 1, 20)) for _ in range(2))
+        image = torch.rand(2, 3, height, width)
+        whole = pad_border(image, radius, border)
+        top = data.draw(st.integers(0, height - 1))
+        bottom = data.draw(st.integers(top + 1, height))
+        band = extended(image, (top - radius, bottom + radius), (-radius, width + radius), border)
+        assert torch.equal(band, whole[..., top : bottom + 2 * radius, :])
 
     def test_feature_valid_makes_nothing_up(self, device, dtype):
         image = torch.rand(1, 1, 5, 7, device=device, dtype=dtype)

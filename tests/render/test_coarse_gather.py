@@ -9,12 +9,13 @@ import torch
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.geometric_psf import geometric_psfs
-from kornia_tidy.psf.pieces import Piece
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.wide_blur import GRID_ERROR, SCENE_DEVIATION, window_of
-from kornia_tidy.render.coarse_gather import _sharpened, gather_group
+from kornia_tidy.render.coarse_gather import _sharpened
 from kornia_tidy.render.compositing import gather
+from kornia_tidy.render.dispatch import Rendering
+from kornia_tidy.render.pieces import Piece, render_piece
 from tests.base import BaseTester
 
 STEP = 1.625e-6
@@ -41,6 +42,11 @@ def group_of(
     bank = PSFBank(psfs, torch.tensor(nodes, dtype=dtype), psfs.sum((2, 3)))
     ends = None if span is None else (defocus_of(span[0]), defocus_of(span[1]))
     return Piece(lambda: bank, 1.0, ends, grid, window)
+
+
+def gather_group(image: torch.Tensor, defocus: torch.Tensor, group: Piece, border: str = "reflect") -> torch.Tensor:
+    """What the pixels of a group see."""
+    return render_piece(image, defocus, group, Rendering("gather", border))
 
 
 def light(size: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:

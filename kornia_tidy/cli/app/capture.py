@@ -28,7 +28,7 @@ from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth, split_maps, stretched
 from kornia_tidy.reconstruction.trained import TrainedSystem, update_psfs
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 WIDEST_BLUR = 65  # pixels; the PSF window of a capture holds no more
 

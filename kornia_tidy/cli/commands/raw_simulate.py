@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from kornia_tidy.cli.commands.report import Stages
     from kornia_tidy.lab.raw.capture import RawCapture
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 USUAL = {"full_well": 10500.0, "read_noise": 2.4}  # electrons: a small industrial sensor of 3.45 um pixels
 PATTERN, BITS = "RGGB", 12

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.optics.thin_lens import ThinLensCamera
     from kornia_tidy.psf.psf_bank import PSFBank
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 File = Annotated[str, Unit("FILE")]
 Out = Annotated[str, Unit("OUT")]
@@ -125,7 +125,7 @@ class SensorInElectrons:
         Raises:
             ValueError: if the noise is given twice, or not at all.
         """
-        from kornia_tidy.sensor.noise import SensorNoise
+        from kornia_tidy.sensor.sensor import SensorNoise
 
         given = {name: value for name in ("full_well", "read_noise") if (value := getattr(self, name)) is not None}
         if self.noise is not None:
@@ -256,7 +256,7 @@ def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTra
     if given is None:
         return None, None
     from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
     if not isinstance(given, str):
         return SensorNoise(given), None

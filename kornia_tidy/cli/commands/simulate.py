@@ -108,7 +108,7 @@ The first example in Python, the same but for the rounding to 8 bits:
 
         from kornia_tidy.cli.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
         from kornia_tidy.data.image_files import write_image
-        from kornia_tidy.sensor.noise import SensorNoise
+        from kornia_tidy.sensor.sensor import SensorNoise
 
         output = self.output or f"{Path(self.image).stem}_coded.png"
         check_output(output, self.image, self.depth, self.camera.psfs, bits=self.bits)

@@ -13,7 +13,7 @@ from kornia_tidy.reconstruction.pretrained import FOLDER
 
 if TYPE_CHECKING:
     from kornia_tidy.reconstruction.trained import TrainedSystem
-    from kornia_tidy.sensor.noise import SensorNoise
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def head_file(head: str) -> Path:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.lab.raw.develop import balance_factors, srgb_matrix
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 if TYPE_CHECKING:
     from kornia_tidy.lab.raw.capture import RawCapture

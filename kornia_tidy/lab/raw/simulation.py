@@ -17,7 +17,7 @@ from kornia_tidy.checks import check_choice, check_finite, check_float_tensor
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.color import camera_to_srgb, srgb_from_xyz
 from kornia_tidy.lab.raw.filter_array import tiled
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 COLORS = ("camera", "channels")
 

@@ -16,7 +16,7 @@ from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera, in_words, pool_names
 from tests.benchmarks.any_camera.captures import LEVELS, stored
 

@@ -27,7 +27,7 @@ from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED, RuledClosedFor
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.noisy_crops import random_gain
 from kornia_tidy.training.task_loss import psnr_ssim_loss

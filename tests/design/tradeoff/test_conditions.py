@@ -97,7 +97,7 @@ class TestConditions(BaseTester):
             "kernels/vectors.h",
             "kernels/build.py",
             "masks/base.py",
-            "sensor/noise.py",
+            "sensor/sensor.py",
             "accuracy/planner.py",
             "accuracy/error_model.py",
             "design/tradeoff/sweep_settings.py",

@@ -265,7 +265,7 @@ class TestPlan(BaseTester):
         psi = depth_map(kind, bank, 37 + lost, 51 + lost)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
         grid = Grid(2, (37, 51), 4, (16, 16), 2, windowed)
-        plan, (down, across) = plan_pairs(grid, Labels.of(label, None), 6, limit=9), grid.tile
+        plan, (down, across) = plan_pairs(grid, Labels(label, None), 6, limit=9), grid.tile
         found, numbers = {}, []
         for chunk in plan.chunks:
             assert len(chunk.layer) <= 9 or chunk.extent == (1, 1, 1)

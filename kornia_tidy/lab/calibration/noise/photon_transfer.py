@@ -29,7 +29,7 @@ from kornia_tidy.lab.calibration.noise.transfer_curve import (
     tile_of,
 )
 from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
 from kornia_tidy.lab.calibration.psf.shrinkage import shrink
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 SATURATION = 0.95  # of full scale; above, noise may have been clipped
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from kornia_tidy.lab.calibration.psf.point_images import PointImage, Tile, point_images
 from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 Picture = tuple[Tensor, Tile | None]
 """Linear light (C, H, W) or, of a mosaic, the planes of its tile and their channels."""

@@ -17,7 +17,7 @@ from kornia_tidy.lab.calibration.psf.points import (
     find_points,
     light_around,
 )
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 
 MARGIN = 8  # pixels around the window, where a sub-pixel shift of an image may ring
 NOTHING = torch.zeros(1, dtype=torch.float64)

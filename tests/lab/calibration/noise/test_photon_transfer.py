@@ -25,7 +25,7 @@ from kornia_tidy.lab.calibration.noise.photon_transfer import (
 from kornia_tidy.lab.calibration.noise.transfer_curve import CurvePoint
 from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
 from kornia_tidy.lab.raw.simulation import simulate_raw
-from kornia_tidy.sensor.noise import SensorNoise
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester, shared
 from tests.lab.calibration.noise.flats import flat, flats
 

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.design.tradeoff.costs import peak_bytes
-from kornia_tidy.psf import exact, pieces
-from kornia_tidy.psf.pieces import Piece, comes_in_pieces, layer_bytes, pieces_of, runs_of
-from kornia_tidy.render.exposure import render_pieces
+from kornia_tidy.psf import exact
+from kornia_tidy.render import pieces
+from kornia_tidy.render.dispatch import Rendering
+from kornia_tidy.render.pieces import Piece, comes_in_pieces, layer_bytes, pieces_of, render_pieces, runs_of
 from tests.base import BaseTester
 
 # Layer weights carry a rounding of defocus over the layers' spacing, 1e2 units of the last place; PSFs and transforms
@@ -57,14 +58,15 @@ def few(monkeypatch):
 def both(optics: TiDyOptics, light: Tensor, psi: Tensor, parts: list[Piece]) -> tuple[Tensor, Tensor]:
     """Return the irradiance through pieces and through all PSFs at once."""
     whole = pieces_of(optics.psf_model, light.shape[1], light.dtype, psi, optics.compositing)
-    rendering = optics.rendering(light.device)
+    layers = optics.fidelity.layers
+    rendering = Rendering(optics.compositing, optics.border, layers, optics.fidelity.correlate)
     return render_pieces(light, psi, parts, rendering), render_pieces(light, psi, whole, rendering)
 
 
 class TestPieces(BaseTester):
     def test_exception_no_piece(self):
         with pytest.raises(ValueError, match="at least one piece"):
-            render_pieces(*make_scene(), [], make_optics().rendering(torch.device("cpu")))
+            render_pieces(*make_scene(), [], Rendering("gather", "reflect"))
 
     @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
     @pytest.mark.parametrize("compositing", ["gather", "scatter"])

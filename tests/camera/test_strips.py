@@ -1,32 +1,15 @@
-"""Bands of rows against the whole image, and a camera that takes large pictures within its memory."""
+"""A camera that takes large pictures within its memory, strip by strip."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.design.tradeoff.costs import peak_bytes
-from kornia_tidy.render.bands import padded_band
-from kornia_tidy.render.borders import BORDERS, pad_border
+from kornia_tidy.render.borders import BORDERS
 from tests.base import BaseTester
-
-
-class TestPaddedBand(BaseTester):
-    @given(data=st.data())
-    @settings(max_examples=100)
-    def test_property_is_a_part_of_the_padded_image(self, data):
-        radius, border = data.draw(st.integers(0, 4)), data.draw(st.sampled_from(BORDERS))
-        height, width = (data.draw(st.integers(2 * radius + 1, 20)) for _ in range(2))
-        image = torch.rand(2, 3, height, width)
-        whole = pad_border(image, radius, border)
-        top = data.draw(st.integers(0, whole.shape[-2] - 2 * radius - 1))
-        rows = slice(top, data.draw(st.integers(top + 1, whole.shape[-2] - 2 * radius)))
-        band = padded_band(image, rows, radius, border)
-        self.assert_close(band, whole[..., rows.start : rows.stop + 2 * radius, :], rtol=0, atol=0)
 
 
 def make_optics(**options) -> TiDyOptics:
