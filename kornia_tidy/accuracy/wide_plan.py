@@ -21,7 +21,7 @@ from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
 from kornia_tidy.render.dispatch import Rendering
-from kornia_tidy.render.pieces import pieces_of, render_pieces
+from kornia_tidy.render.pieces import pieces_of, render_piece
 
 SAFETY = 1.5  # measured errors are up to 1.2 times the formula
 _DEPTHS = 16  # of the scene at which PSFs are compared
@@ -84,8 +84,8 @@ def _ray_changes(optics: Any, blur: WideBlur, scene: PlannedScene, nodes: list[f
     exact = planner.psfs(nodes, window, optics.fidelity.pixel_tolerance, None)
     for i, psi in enumerate(nodes):
         at = torch.full((1, 1, side, side), psi, dtype=torch.float64)
-        pieces = pieces_of(optics.psf_model, planner.channels, torch.float64, at)
-        changes[:, i] = render_pieces(point, at, pieces, Rendering("gather", "zero"))
+        for piece in pieces_of(optics.psf_model, planner.channels, torch.float64, at):
+            changes[:, i] += render_piece(point, at, piece, Rendering("gather", "zero"))
         for own, place in zip(changes[:, i], places, strict=True):
             own[:, place : place + window, place : place + window] -= exact[i]
     return changes

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING, Any, Self, cast
 
 import torch
@@ -39,7 +41,7 @@ from kornia_tidy.psf.wide_psfs import held_nodes
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.render.dispatch import Explanation, Rendering, explain
-from kornia_tidy.render.pieces import comes_in_pieces, pieces_of, render_pieces
+from kornia_tidy.render.pieces import comes_in_pieces, pieces_of, render_piece
 from kornia_tidy.render.scene import layered_scene
 from kornia_tidy.sensor.sensor import Sensor, SensorNoise, check_sensor
 
@@ -238,9 +240,12 @@ class TiDyOptics(CameraState):
         device, dtype = sample.image.device, sample.image.dtype
         with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
             for strip in self.strips(sample):  # one, of the whole picture, unless memory is short
-                irradiance = self.blurred(strip)
-                seen = self.encode(self.expose(irradiance, params, generator, strip.rows)).to(dtype)
-                coded = seen if strip.rows is None else placed(coded, seen, strip.rows, self.height(sample))
+                seen, rows = self.blurred(strip), strip.rows or slice(0, None)
+                if self.sensor is not None:
+                    noise = None if params is None else {name: field[..., rows, :] for name, field in params.items()}
+                    seen = self.sensor(seen, params=noise, generator=generator, origin=(rows.start, 0))
+                seen = self.encode(seen).to(dtype)
+                coded = seen if strip.rows is None else placed(coded, seen, rows, self.height(sample))
             return sample.coded(cast("Tensor", coded))
 
     def blurred(self, strip: Strip) -> Tensor:
@@ -257,7 +262,7 @@ class TiDyOptics(CameraState):
         pieces = pieces_of(self.psf_model, light.shape[1], light.dtype, strip.reach, *given, field)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
         rendering = Rendering(self.compositing, strip.border, layers, fidelity.correlate)
-        return render_pieces(light, defocus, pieces, rendering)
+        return reduce(add, (render_piece(light, defocus, piece, rendering) for piece in pieces))
 
     def strips(self, sample: Sample) -> Iterator[Strip]:
         """Yield the strips that a picture is taken in: ordinarily one, which is all of it.
@@ -342,29 +347,6 @@ class TiDyOptics(CameraState):
         """
         checked = self.check_inputs and not torch_mode() & (Mode.GRAPH | Mode.UNREAD)
         return self.psf_model.camera.defocus(depth, check_inputs=checked)
-
-    def expose(
-        self,
-        irradiance: Tensor,
-        params: Mapping[str, Tensor] | None = None,
-        generator: torch.Generator | None = None,
-        rows: slice | None = None,
-    ) -> Tensor:
-        """Return what the sensor reports of an irradiance, in linear light. See :meth:`forward` for the noise.
-
-        Args:
-            irradiance: (B, C, h, w).
-            params: noise of the whole capture.
-            generator: source of the noise.
-            rows: of the capture that the irradiance is. Default: all.
-        """
-        if self.sensor is None:
-            return irradiance
-        if rows is None:
-            return self.sensor(irradiance, params=params, generator=generator)
-        if params is not None:
-            params = {name: field[..., rows, :] for name, field in params.items()}
-        return self.sensor(irradiance, params=params, generator=generator, origin=(rows.start, 0))
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.

@@ -9,12 +9,12 @@ on coarse grids). A piece computes its PSFs when it is asked for them, so that a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from math import inf
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -144,47 +144,24 @@ def pieces_of(
             yield Piece(own, span=span, field=field, keep=False)
 
 
-def render_pieces(light: Tensor, defocus: Tensor, pieces: Iterable[Piece], rendering: Rendering) -> Tensor:
-    """Return the irradiance of a scene on the sensor, over the whole exposure.
+def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Rendering) -> Tensor:
+    """Return a piece's share of the irradiance, (B, C, h, w): zero where neither its pixels are nor their light falls.
 
     Args:
         light: (B, C, H, W) linear light.
         defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        pieces: from :func:`pieces_of`, at least one.
+        piece: PSFs. Gradients make those that are not kept once more.
         rendering: how.
-
-    Returns:
-        (B, C, h, w), smaller than the light with the border ``"valid"``. Gradients make pieces whose PSFs are not kept
-        once more.
 
     Example:
         >>> light, defocus = torch.ones(1, 3, 32, 32), torch.zeros(1, 1, 32, 32)
-        >>> pieces = pieces_of(PSFModel(fidelity="draft"), 3, light.dtype, defocus)
-        >>> render_pieces(light, defocus, pieces, Rendering("gather", "reflect")).detach().mean().round()
+        >>> [piece] = pieces_of(PSFModel(fidelity="draft"), 3, light.dtype, defocus)
+        >>> render_piece(light, defocus, piece, Rendering("gather", "reflect")).detach().mean().round()
         tensor(1.)
     """
-    total = None
-    for piece in pieces:
-        if piece.keep or not torch.is_grad_enabled():
-            own = render_piece(light, defocus, piece, rendering)
-        else:
-            given = light, defocus, piece, rendering
-            own = checkpoint(render_piece, *given, use_reentrant=False, preserve_rng_state=False)
-        total = own if total is None else total + own
-    if total is None:
-        raise ValueError("a capture is a sum over at least one piece, got none")
-    return total
-
-
-def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Rendering) -> Tensor:
-    """Return a piece's share of the irradiance: zero where neither its pixels are nor their light falls.
-
-    Args:
-        light: (B, C, H, W) linear light.
-        defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        piece: PSFs.
-        rendering: how.
-    """
+    if not piece.keep and torch.is_grad_enabled():
+        given = light, defocus, replace(piece, keep=True), rendering
+        return cast("Tensor", checkpoint(render_piece, *given, use_reentrant=False, preserve_rng_state=False))
     if piece.window is not None:
         margin = piece.window // 2 if rendering.border == "valid" else 0
         return gather_group(light, defocus, piece.bank(), piece.holds(defocus), piece.grid, margin, rendering.border)

@@ -11,7 +11,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.render.compositing import gather
 from kornia_tidy.render.dispatch import Rendering
-from kornia_tidy.render.pieces import pieces_of, render_pieces
+from kornia_tidy.render.pieces import pieces_of, render_piece
 from tests.base import BaseTester
 from tests.render.test_coarse_gather import light
 
@@ -153,7 +153,7 @@ class TestWideCaptures(BaseTester):
             after = int(torch.searchsorted(nodes, psi))
             at = torch.full((1, 1, 128, 128), float(nodes[after - 1] + nodes[after]) / 2)
             pieces = pieces_of(optics.psf_model, 1, torch.float32, at)
-            seen = render_pieces(image, at, pieces, Rendering("gather", "circular"))
+            seen = sum(render_piece(image, at, piece, Rendering("gather", "circular")) for piece in pieces)
             exact = exact_psf_bank(
                 torch.zeros(1, 23, 23), torch.ones(1), optics.pupil, Spectrum.monochrome(), [1.0],
                 [float(at[0, 0, 0, 0])], step, blur.window, 1e-2,

@@ -59,7 +59,10 @@ class CompiledBackend:
         if not _fits(scene, smallest := occlusion_ops.smallest_output(image.dtype)):
             least, size = ("x".join(map(str, sides)) for sides in (smallest, scene.output_size))
             return f"its occlusion needs an output of at least {least} pixels, got {size}"
-        lowest = float(scene.psfs.detach().clamp(max=0).sum((-2, -1)).min())
+        psfs = scene.psfs.detach()
+        lowest = float(psfs.min())
+        if lowest < 0:
+            lowest = float(psfs.clamp(max=0).sum((-2, -1)).min())
         if lowest < -NEGATIVE:  # sums keep their relative accuracy only where what is added up is positive
             return (
                 f"its occlusion needs PSFs without negative values, got one with {lowest:.1e} of its light below zero"
@@ -93,7 +96,7 @@ class CompiledBackend:
             operations = words * occlusion_ops.count_operations(*scene.sorted_layers, scene.psfs, batch)
             return Work(operations, 2 * image + 32 * labels.layer_index.numel())
         kept = 16 * labels.layer_index.numel()
-        if _goes_directly(scene):
+        if _Sums(scene).directly:
             blended = 1 if labels.layer_weight is None else 2
             return Work(2 * blended * words * pixels * side**2, 2 * image + kept)
         size = window_size(side)
@@ -112,9 +115,11 @@ class _Sums:
 
     def __init__(self, scene: LayeredScene) -> None:
         self.psfs, self.labels = scene.psfs.detach(), (scene.labels.layer_index, scene.labels.layer_weight)
-        self.size, self.directly, self.places = window_size(scene.psfs.shape[-1]), _goes_directly(scene), ()
+        self.size, self.directly, self.places = window_size(scene.psfs.shape[-1]), False, ()
         if scene.field is not None:
             self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
+        elif scene.compositing == "gather" and scene.psfs.shape[-1] <= LARGEST_DIRECT:
+            self.directly = _fits(scene, gather_ops.smallest_output(scene.image.dtype))
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         if self.directly:
@@ -142,11 +147,6 @@ def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs
         found = occlusion_direct_gradients(light, psfs, index, weight, mean, stray_light, inside, gradient)
     pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])
     return [(tensor, own) for tensor, own in pairs if tensor.requires_grad]
-
-
-def _goes_directly(scene: LayeredScene) -> bool:
-    small = scene.compositing == "gather" and scene.psfs.shape[-1] <= LARGEST_DIRECT and scene.field is None
-    return small and _fits(scene, gather_ops.smallest_output(scene.image.dtype))
 
 
 def _fits(scene: LayeredScene, smallest: tuple[int, int]) -> bool:
