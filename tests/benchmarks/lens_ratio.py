@@ -1,7 +1,8 @@
 """Captures through a real lens over captures of the ideal lens, and the kernels alone, in one process by turns.
 
-``python -m tests.benchmarks.lens_ratio``; a minute. ``--size 1110 1282`` takes the picture of the stated ratios, minutes.
-Dead leaves of 3,000 px each, five masks, 21 layers, one thread, the single element at f/17.6; least processor time of some rounds.
+``python -m tests.benchmarks.lens_ratio``; a minute. ``--size 1110 1282`` takes the picture of the stated ratios, which
+takes minutes. Dead leaves of 3,000 px each, five masks, 21 layers, one thread, the single element at f/17.6; least
+processor time of some rounds.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 import torch
+from kornia_tidy.render.render_ops import Rendering, render_layers
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.over_field import render_over_field
-from kornia_tidy.render.render_ops import Rendering, render_layers
 
 WINDOWS = (23, 61)
 LENS = "single-50mm"
