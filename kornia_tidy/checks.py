@@ -29,6 +29,13 @@ def check_positive(name: str, value: float, unit: str = "") -> None:
         raise ValueError(f"{name} must be positive and finite{' ' + unit if unit else ''}, got {value}")
 
 
+def check_not_negative(name: str, value: float, unit: str = "") -> None:
+    """Raise ``ValueError`` unless ``value`` is zero or positive and finite, ``TypeError`` if it is not a number."""
+    check_number(name, value, unit)
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"{name} must be zero or positive and finite{', ' + unit if unit else ''}, got {value}")
+
+
 def check_number(name: str, value: Any, unit: str = "") -> None:
     """Raise ``TypeError`` unless ``value`` is a single number."""
     if isinstance(value, str) or not hasattr(value, "__float__"):

@@ -15,7 +15,7 @@ from kornia_tidy.checks import (
     check_choice,
     check_float_tensor,
     check_generator,
-    check_number,
+    check_not_negative,
     check_part,
     check_positive,
 )
@@ -30,7 +30,7 @@ class Sensor(nn.Module):
     """Base of sensors: a subclass draws noise and records light with it.
 
     A camera takes any module with this ``forward`` and ``draw``. CONTRIBUTING has a recipe. Restorations that use the
-    noise call a method ``std(light)``: the standard deviation of the noise in units of full scale.
+    noise call a method ``std(light)``: the standard deviation of what is drawn in units of full scale.
 
     Shape:
         - image: (B, C, H, W), linear light, 1.0 = full scale, float16, bfloat16, float32 or float64.
@@ -206,8 +206,8 @@ class SensorNoise(Sensor):
         offset: Tensor | None = None,
     ) -> None:
         super().__init__()
-        _check_not_negative("sigma", sigma, "in units of full scale")
-        _check_not_negative("dark", dark, "electrons")
+        check_not_negative("sigma", sigma, "in units of full scale")
+        check_not_negative("dark", dark, "electrons")
         if full_well is not None:
             check_positive("full_well", full_well, "electrons")
             if dark >= full_well:
@@ -241,7 +241,7 @@ class SensorNoise(Sensor):
             SensorNoise(read noise 0.0005 of full scale, full well 10000 electrons, 12 bits, clipped to [0, 1])
         """
         check_positive("full_well", full_well, "electrons")
-        _check_not_negative("read_noise_electrons", read_noise_electrons, "electrons")
+        check_not_negative("read_noise_electrons", read_noise_electrons, "electrons")
         return cls(read_noise_electrons / full_well, full_well=full_well, dark=dark_electrons, bits=bits)
 
     @property
@@ -307,12 +307,6 @@ class SensorNoise(Sensor):
         words += [f"pixels with {' and '.join(pattern)} of their own"] if pattern else []
         words += ["clipped to [0, 1]" if self.clip else "not clipped"]
         return ", ".join(words)
-
-
-def _check_not_negative(name: str, value: float, unit: str) -> None:
-    check_number(name, value, unit)
-    if not 0 <= value < float("inf"):
-        raise ValueError(f"{name} must be zero or positive and finite, {unit}, got {value}")
 
 
 def check_sensor(sensor: nn.Module | None) -> None:

@@ -214,9 +214,9 @@ class TestEveryHead(BaseTester):
             head = head.to(memory_format=torch.channels_last)
             layouts = []
             for module in head.modules():
-                if isinstance(module, torch.nn.BatchNorm2d | torch.nn.LayerNorm):
-                    module.register_forward_hook(
-                        lambda _, i, o: layouts.append(o.is_contiguous(memory_format=torch.channels_last))
+                if isinstance(module, torch.nn.Conv2d | torch.nn.ConvTranspose2d):
+                    module.register_forward_pre_hook(
+                        lambda _, i: layouts.append(i[0].is_contiguous(memory_format=torch.channels_last))
                     )
             out = head(image.to(memory_format=torch.channels_last))
         self.assert_close(out, expected, atol=1e-4)
