@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,19 +14,24 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.cli.app.scenes import chart, read_files
-from kornia_tidy.cli.app.settings import AS_SYSTEM, FILES, FLAT, OWN, Settings
+from kornia_tidy.cli.app.settings import AS_SYSTEM, FILES, FLAT, IDEAL, OWN, Settings
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.optics.lens import NAMED_LENSES
+from kornia_tidy.optics.lens.lens import LensRangeWarning
+from kornia_tidy.optics.lens.made_lenses import named_focal_length
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth, split_maps, stretched
 from kornia_tidy.reconstruction.trained import TrainedSystem, update_psfs
 from kornia_tidy.sensor.sensor import SensorNoise
@@ -88,13 +94,15 @@ def take_picture(settings: Settings, tell: Tell = lambda share, stage: None) -> 
         >>> result.capture.shape, result.estimate.shape
         (torch.Size([3, 72, 96]), torch.Size([1, 72, 96]))
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _known_lens():
         warnings.simplefilter("ignore", UserWarning)  # pixels beyond the range are counted in the result
+        warnings.simplefilter("error", LensRangeWarning)
         tell(0.05, "scene")
         if settings.camera == OWN:
             scene = read_scene(settings, None)
             tell(0.2, "camera")
-            optics, system = own_optics(settings, own_camera(settings, scene)), None
+            camera, size = own_camera(settings, scene), (scene.depth.shape[-2], scene.depth.shape[-1])
+            optics, system = own_optics(settings, camera, size), None
         else:
             optics, system = known_system(settings.camera, settings.compositing, settings.noise, settings.mask_seed)
             scene = read_scene(settings, _lens(optics) if settings.stretch else None)
@@ -142,6 +150,8 @@ def own_camera(settings: Settings, scene: Scene) -> ThinLensCamera:
         ValueError: if the lens cannot be made, or its blur is wider than the PSFs of a capture.
     """
     focal_length, pixel_pitch = settings.focal_length, settings.pixel_pitch
+    if settings.lens != IDEAL:
+        focal_length = named_focal_length(settings.lens)
     if settings.fit:
         return ThinLensCamera.for_scene(depth_ends(scene), focal_length=focal_length, pixel_pitch=pixel_pitch)
     nearest, farthest = (float(end) for end in scene.depth.aminmax())
@@ -192,8 +202,31 @@ focus and depths closer together
         )
 
 
-def own_optics(settings: Settings, camera: ThinLensCamera) -> TiDyOptics:
-    """Return the camera with the masks, compositing and noise of the settings."""
+@contextmanager
+def _known_lens() -> Generator[None]:
+    """Raise ``ValueError`` where a lens is asked for depths or heights that its table does not hold."""
+    try:
+        yield
+    except LensRangeWarning as warning:
+        raise ValueError(f"{str(warning).partition(',')[0]}: choose another focus, depths or size") from None
+
+
+def field_center(settings: Settings, camera: ThinLensCamera, size: tuple[int, int]) -> tuple[float, float]:
+    """Return where the middle of a picture lies in the field of the lens, y and x in whole pixels from its axis.
+
+    Example:
+        >>> field_center(Settings(lens="single-50mm", place=1.0), ThinLensCamera(), (240, 320))
+        (458.0, 458.0)
+    """
+    if settings.lens == IDEAL:
+        return 0.0, 0.0
+    free = NAMED_LENSES[settings.lens]["field"] / camera.pixel_pitch - math.hypot(*size) / 2
+    along = float(math.floor(settings.place * max(0.0, free) / math.sqrt(2)))
+    return along, along
+
+
+def own_optics(settings: Settings, camera: ThinLensCamera, size: tuple[int, int]) -> TiDyOptics:
+    """Return the camera with the lens, masks, compositing and noise of the settings, for a picture of a size."""
     noise = torch.Generator().manual_seed(settings.mask_seed)
     if settings.start == FLAT:
         masks = PixelwiseMask(1, initial="flat")
@@ -202,7 +235,9 @@ def own_optics(settings: Settings, camera: ThinLensCamera) -> TiDyOptics:
     else:
         masks = PixelwiseMask(initial=initial_heights(settings.start, noise)[: settings.masks])
     compositing = "gather" if settings.compositing == AS_SYSTEM else settings.compositing
-    return TiDyOptics(masks, camera, sensor=SensorNoise(settings.noise), compositing=compositing)
+    lens, center = None if settings.lens == IDEAL else settings.lens, field_center(settings, camera, size)
+    sensor = SensorNoise(settings.noise)
+    return TiDyOptics(masks, camera, sensor=sensor, compositing=compositing, lens=lens, field_center=center)
 
 
 @lru_cache(8)
@@ -226,7 +261,15 @@ def reconstruct(capture: Tensor, optics: TiDyOptics, system: TrainedSystem | Non
     if system is None:
         head = ClosedFormHead()
         update_psfs(head, optics)
-        return head(capture[None])[0], None
+        if optics.lens is None:
+            return head(capture[None])[0], None
+
+        def restore(part: Tensor, psfs: PSFBank) -> Tensor:
+            head.closed_form.set_psfs(psfs)
+            return head(part)
+
+        center = optics.field_center
+        return restored_over_field(capture[None], optics.psf_model, restore, center=center)[0], None
     maps = split_maps(system.settings.task, system.head(capture[None]))
     depth = maps.get("depth")
     return maps["image"][0].clamp(0, 1), None if depth is None else depth[0].clamp(0, 1)

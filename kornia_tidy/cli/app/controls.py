@@ -7,8 +7,20 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from typing import Any, Literal, NamedTuple
 
-from kornia_tidy.choices import STARTS
-from kornia_tidy.cli.app.settings import AS_SYSTEM, CHART, FILES, FLAT, MOST_MASKS, OWN, SCENES, SEEDS, SIDES, Settings
+from kornia_tidy.choices import LENSES, STARTS
+from kornia_tidy.cli.app.settings import (
+    AS_SYSTEM,
+    CHART,
+    FILES,
+    FLAT,
+    IDEAL,
+    MOST_MASKS,
+    OWN,
+    SCENES,
+    SEEDS,
+    SIDES,
+    Settings,
+)
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.reconstruction.pretrained import PRETRAINED
 
@@ -139,6 +151,25 @@ CONTROLS = (
         "Its depths then have a defocus of -20 to +20 rad.",
     ),
     Control("focal_length", "Focal length (mm)", "number", "own camera", low=1, high=1000, per_unit=-3),
+    Control(
+        "lens",
+        "Lens",
+        "choice",
+        "own camera",
+        "A real lens has its own focal length, and its PSFs vary over the picture.",
+        [("ideal", IDEAL), *((name, name) for name in LENSES)],
+    ),
+    Control(
+        "place",
+        "Place of the picture in a real lens's field (%)",
+        "slider",
+        "own camera",
+        "0 is the middle; at 100 a corner of the picture is at the edge of the field.",
+        low=0,
+        high=100,
+        step=5,
+        per_unit=-2,
+    ),
     Control("pixel_pitch", "Pixel pitch (µm)", "number", "own camera", low=0.5, high=50, per_unit=-6),
     Control(
         "start",

@@ -55,9 +55,11 @@ def status(result: Result, seconds: float) -> str:
     """Return camera and time in one line, and a note if pixels lie beyond the camera's range."""
     camera = result.camera
     near, far = (f"{end:.3g} m" if math.isfinite(end) else "infinity" for end in camera.depth_range)
+    lens = f"{result.optics.lens.name}, " if result.optics.lens is not None else ""
     line = (
-        f"{camera.focal_length * 1e3:.4g} mm f/{camera.f_number:.3g}, focus at {float(camera.focus_distance):.3g} m, "
-        f"pixels of {camera.pixel_pitch * 1e6:.3g} µm, depths from {near} to {far}. Computed in {seconds:.1f} s."
+        f"{lens}{camera.focal_length * 1e3:.4g} mm f/{camera.f_number:.3g}, focus at "
+        f"{float(camera.focus_distance):.3g} m, pixels of {camera.pixel_pitch * 1e6:.3g} µm, "
+        f"depths from {near} to {far}. Computed in {seconds:.1f} s."
     )
     if result.clamped <= MANY_CLAMPED:
         return line

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 from kornia_tidy.cli.app.capture import Result
-from kornia_tidy.cli.app.settings import AS_SYSTEM, FILES, FLAT, OWN, Settings
+from kornia_tidy.cli.app.settings import AS_SYSTEM, FILES, FLAT, IDEAL, OWN, Settings
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.pretrained import PRETRAINED
 
@@ -25,6 +25,7 @@ PLACES = {
     "metres": "kornia_tidy.reconstruction.tasks",
     "photographic_leaves": "kornia_tidy.data",
     "read_files": "kornia_tidy.cli.app.scenes",
+    "restored_over_field": "kornia_tidy.reconstruction",
     "split_maps": "kornia_tidy.reconstruction.tasks",
     "stretched": "kornia_tidy.reconstruction.tasks",
     "update_psfs": "kornia_tidy.reconstruction.trained",
@@ -32,6 +33,18 @@ PLACES = {
     "write_image": "kornia_tidy.data",
 }
 """Names that a script may use, and the module of each."""
+
+
+_AT_ONCE = "    reconstruction = head(capture[None])[0]"
+_OVER_FIELD = [
+    "",
+    "    def restore(part, psfs):  # by the PSFs of its place",
+    "        head.closed_form.set_psfs(psfs)",
+    "        return head(part)",
+    "",
+    "    given = capture[None], optics.psf_model, restore",
+    "    reconstruction = restored_over_field(*given, center=optics.field_center)[0]",
+]
 
 
 def as_python(result: Result) -> str:
@@ -51,7 +64,7 @@ def as_python(result: Result) -> str:
         'A coded capture with the settings of `kornia-tidy app`.'
     """
     settings = result.settings
-    camera = own(settings, result.camera) if settings.camera == OWN else known(settings)
+    camera = own(settings, result.camera, result.optics.field_center) if settings.camera == OWN else known(settings)
     body = "\n\n".join([camera, scene(settings), capture(settings, result.estimate is not None)])
     return f'"""A coded capture with the settings of `kornia-tidy app`."""\n\n{imports(body)}\n\n{body}\n'
 
@@ -72,8 +85,8 @@ def known(settings: Settings) -> str:
     return _call("optics = TiDyOptics.from_preset", arguments)
 
 
-def own(settings: Settings, camera: ThinLensCamera) -> str:
-    """Return the lines that make the own camera; lengths in metres."""
+def own(settings: Settings, camera: ThinLensCamera, center: tuple[float, float]) -> str:
+    """Return the lines that make the own camera; lengths in metres, the picture's place in pixels from the axis."""
     values = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch")
     lens = [f"{name}={_number(float(getattr(camera, name)))}" for name in values]
     lens.append(f"depth_range=({', '.join(map(_number, camera.depth_range))})")
@@ -86,6 +99,8 @@ def own(settings: Settings, camera: ThinLensCamera) -> str:
         masks = f"PixelwiseMask(initial={heights}[:{settings.masks}])"
     compositing = "gather" if settings.compositing == AS_SYSTEM else settings.compositing
     made = ["masks", "camera", f"sensor=SensorNoise({settings.noise!r})", f"compositing={_text(compositing)}"]
+    if settings.lens != IDEAL:
+        made += [f"lens={_text(settings.lens)}", f"field_center={center}"]
     lines = [f"# f/{camera.f_number:.3g}; lengths in metres", _call("camera = ThinLensCamera", lens)]
     return "\n".join([*lines, f"masks = {masks}", _call("optics = TiDyOptics", made)])
 
@@ -119,7 +134,7 @@ def capture(settings: Settings, has_depth: bool) -> str:
         lines.append('    reconstruction = maps["image"][0].clamp(0, 1)')
     else:
         lines += ["    head = ClosedFormHead()", "    update_psfs(head, optics)"]
-        lines.append("    reconstruction = head(capture[None])[0]")
+        lines += _OVER_FIELD if settings.camera == OWN and settings.lens != IDEAL else [_AT_ONCE]
     lines += ['write_image("capture.png", capture)', 'write_image("reconstruction.png", reconstruction)']
     if has_depth:
         lines.append('write_depth("depth.npy", metres(optics.camera, maps["depth"][0]))')

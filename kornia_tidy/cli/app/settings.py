@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.choices import STARTS
+from kornia_tidy.choices import LENSES, STARTS
 from kornia_tidy.data.dead_leaves import MOST_LEAVES, PIXELS_A_LEAF
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -20,6 +20,7 @@ OWN, FLAT, FILES, CHART = "own", "flat", "files", "test chart"
 SCENES = ("dead leaves", "photographic leaves", CHART, FILES)
 CAMERAS = (*PRETRAINED, *SYSTEMS, OWN)
 AS_SYSTEM = "system"
+IDEAL = "ideal"
 MOST_MASKS, STARTED_MASKS = 16, 5
 SIDES = (96, 768)  # pixels
 MOST_NOISE = 0.5  # of full scale; more leaves no picture
@@ -47,6 +48,8 @@ class Settings:
         focus_distance: its distance in focus, in metres.
         focal_length: in metres.
         pixel_pitch: of its sensor in metres.
+        lens: ``"ideal"``, or the name of a real lens of the own camera, whose focal length it then has.
+        place: where the picture lies in the lens's field: 0 in its middle, 1 with a corner at its edge.
         fit: focus and aperture of the own camera are chosen so that the scene's depths, their middle 99 %, have a
             defocus of -20 to +20 rad.
         start: masks of the own camera: ``"flat"`` for a plain lens, or a name of
@@ -83,6 +86,8 @@ class Settings:
     focus_distance: float = float(LENS.focus_distance)
     focal_length: float = LENS.focal_length
     pixel_pitch: float = LENS.pixel_pitch
+    lens: str = IDEAL
+    place: float = 0.0
     fit: bool = False
     start: str = "like fishers"
     masks: int = MaskSettings.masks
@@ -106,6 +111,9 @@ class Settings:
         check_choice("the scene", self.scene, SCENES)
         check_choice("the camera", self.camera, CAMERAS)
         check_choice("compositing", self.compositing, (AS_SYSTEM, *COMPOSITING))
+        check_choice("the lens", self.lens, (IDEAL, *LENSES))
+        if not 0 <= self.place <= 1:
+            raise ValueError(f"the place in the field must be from 0 to 100 %, got {100 * self.place:g} %")
         check_choice("the masks' start", self.start, (FLAT, *STARTS))
         for name in ("seed", "mask_seed", "noise_seed"):
             if not 0 <= getattr(self, name) < SEEDS:

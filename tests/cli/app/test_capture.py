@@ -13,9 +13,11 @@ from kornia_tidy.cli.app.scenes import chart
 from kornia_tidy.cli.app.script import as_python
 from kornia_tidy.cli.app.settings import CAMERAS, Settings
 from kornia_tidy.data import Scene, dead_leaves, read_depth, read_image, write_depth, write_image
+from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.reconstruction.trained import closed_form_bank, update_psfs
 from tests.base import BaseTester
 
 SMALL = {"side": 96}
@@ -29,6 +31,7 @@ EVERY_KIND = {
     "own": {"camera": "own", "start": "noise", "masks": 7, "scene": "test chart", "noise": 0.0},
     "own, flat, occlusion": {"camera": "own", "start": "flat", "compositing": "occlusion", "f_number": 12.0},
     "own, fitted": {"camera": "own", "start": "focal sweep", "masks": 3, "fit": True, "far": 3.0},
+    "own, behind a lens": {"camera": "own", "start": "noise", "masks": 2, "lens": "double-gauss-50mm", "place": 0.5},
     "files": {**FILES, "noise_seed": 5},
     "files, larger": {**FILES, "stretch": False, "camera": "edof-5"},
     "files, own": {**FILES, "camera": "own", "pixel_pitch": 4e-6, "focus_distance": 1.0},
@@ -171,10 +174,11 @@ class TestScript(BaseTester):
         other = {
             "scene": "photographic leaves", "seed": 1, "side": 128, "near": 0.4, "far": 5.0, "camera": "tidy-1",
             "f_number": 20.0, "focus_distance": 0.7, "focal_length": 0.04, "pixel_pitch": 6e-6, "fit": True,
-            "start": "flat", "masks": 3, "mask_seed": 1, "compositing": "scatter", "noise": 0.01, "noise_seed": 1,
+            "lens": "single-50mm", "start": "flat", "masks": 3, "mask_seed": 1,
+            "compositing": "scatter", "noise": 0.01, "noise_seed": 1,
         }  # fmt: skip
         assert {f.name for f in dataclasses.fields(Settings)} - set(other) == {
-            "image_file", "depth_file", "depth_scale", "stretch"
+            "image_file", "depth_file", "depth_scale", "stretch", "place"
         }  # fmt: skip
         script = as_python(take_picture(base))
         same = [
@@ -183,6 +187,31 @@ class TestScript(BaseTester):
             if as_python(take_picture(dataclasses.replace(base, **{n: value}))) == script
         ]
         assert same == []
+
+
+class TestBehindALens(BaseTester):
+    @pytest.mark.takes_seconds
+    @torch.no_grad()
+    def test_feature_the_corner_is_restored_by_the_psfs_of_the_corner(self):
+        """The closed form of the corner's PSFs, which is .1 of full scale from that of the axis."""
+        options = {"camera": "own", "start": "focal sweep", "masks": 5, "lens": "single-50mm", "side": 128}
+        result = take_picture(Settings(**options, place=1.0, noise=0.003))
+        assert result.optics.lens.name == "single-50mm"
+        assert result.optics.field_center == (543.0, 543.0)
+        head, found = ClosedFormHead(), []
+        update_psfs(head, result.optics)
+        axis = closed_form_bank(result.optics)
+        corner = result.optics.psf_bank(3, defocus=axis.defocus.tolist(), field=[(543.0, 543.0)])
+        for psfs in (axis.psfs, corner.psfs[0]):
+            head.closed_form.set_psfs(dataclasses.replace(axis, psfs=psfs))
+            found.append(float((head(result.capture[None])[0] - result.image).abs().max()))
+        assert found[0] > 0.1
+        assert found[1] < 0.25 * found[0]  # over other depths than the app averages PSFs
+
+    def test_exception_depths_that_the_lens_is_not_known_for(self):
+        settings = Settings(camera="own", lens="single-50mm", near=0.45, far=0.6, f_number=8.0, focus_distance=1.5)
+        with pytest.raises(ValueError, match=r"the lens 'single-50mm' is asked for a defocus of .*: choose another"):
+            take_picture(settings)
 
 
 class TestResult(BaseTester):

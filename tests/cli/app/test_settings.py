@@ -12,7 +12,7 @@ from kornia_tidy.cli.app.controls import CONTROLS, by_name, settings_of, shown
 from kornia_tidy.cli.app.settings import Settings
 from tests.base import BaseTester
 
-UNITS = ("(m)", "(mm)", "(µm)", "(% of full scale)", "(pixels)")
+UNITS = ("(m)", "(mm)", "(µm)", "(% of full scale)", "(%)", "(pixels)")
 UNITED = [control for control in CONTROLS if control.per_unit]
 WITHOUT_UNIT = {"f_number", "masks", "seed", "mask_seed", "noise_seed"}
 
@@ -33,6 +33,8 @@ class TestSettings(BaseTester):
             ({"near": 4.0, "far": 2.0}, "the nearest depth must be positive and below the farthest, got 4 m and 2 m"),
             ({"near": 0.0}, "the nearest depth must be positive"),
             ({"scene": "files"}, "a photo is missing: upload both"),
+            ({"lens": "single"}, "the lens must be one of 'ideal', 'double-gauss-50mm'"),
+            ({"place": 1.5}, "the place in the field must be from 0 to 100 %, got 150 %"),
             ({"camera": "own", "masks": 0}, "the number of masks K must be from 1 to 16, got 0"),
             ({"camera": "own", "start": "focal sweep", "masks": 7}, "'focal sweep' are 5 at most, got K = 7"),
             ({"camera": "own", "f_number": 0.0}, "the f-number must be positive"),
@@ -57,7 +59,7 @@ class TestControls(BaseTester):
 
     def test_feature_each_number_with_a_unit_has_it_in_its_label(self):
         numbers = [c for c in CONTROLS if c.kind in {"number", "slider", "whole"} and c.name not in WITHOUT_UNIT]
-        assert len(numbers) == 7
+        assert len(numbers) == 8
         assert [c.label for c in numbers if not c.label.endswith(UNITS)] == []
 
     @pytest.mark.parametrize("text", ["1e-5", "1E-5", ".00001", "0.00001", "0,00001", " 1e-05 ", "10e-6", 1e-5])
