@@ -19,6 +19,7 @@ from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 
 _LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
+FEWEST_CELLS = 23  # along a side of the stop, where they are alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +162,7 @@ def field_psf_bank(
         >>> field_psf_bank(mask, torch.ones(1), stop, grey, [1.0], [0.0], [(0, 0)], lens, 8e-6, 23).psfs.shape
         torch.Size([1, 1, 1, 23, 23])
     """
+    phase, pupil = _merged(phase, pupil)
     sensor = Sensor(pixel_pitch, window, min(max(tolerance / 10, _LEAST), _MOST))
     apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
@@ -189,6 +191,19 @@ def field_psf_bank(
     return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
 
 
+def _merged(phase: Tensor, pupil: Pupil) -> tuple[Tensor, Pupil]:
+    """Return phase and pupil on fewer cells where these are all alike: a cell is integrated as exactly on any grid."""
+    flat, open_part = phase.detach().flatten(1), pupil.amplitude
+    cells = open_part.shape[-1]
+    times = max(n for n in range(1, cells + 1) if cells % n == 0 and (n == 1 or cells // n >= FEWEST_CELLS))
+    alike = bool((flat == flat[:, :1]).all()) and bool((open_part == open_part.flatten()[0]).all())
+    if phase.requires_grad or open_part.requires_grad or times == 1 or not alike or pupil.fill_factor != 1:
+        return phase, pupil
+    few = cells // times
+    own = phase[:, :1, :1].expand(-1, few, few)
+    return own, Pupil(open_part.flatten()[0].expand(few, few), pupil.cell_pitch * times)
+
+
 def field_light(
     pupil: Pupil,
     spectrum: Spectrum,
@@ -207,6 +222,7 @@ def field_light(
         lens: as there.
         pixel_pitch: as there.
     """
+    pupil = _merged(pupil.amplitude.new_zeros(1, 1, 1), pupil)[1]
     spans, found = whole_cells(pupil), []
     metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
     for wavelength in spectrum.wavelengths:

@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 import torch
-from kornia_tidy.render.render_ops import Rendering, render_layers
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
+from kornia_tidy.render.dispatch import Rendering, render_layers
 from kornia_tidy.render.over_field import render_over_field
 
 WINDOWS = (23, 61)

@@ -206,6 +206,20 @@ class TestLensPSFs(BaseTester):
 
         self.gradcheck(psfs, (torch.rand(1, 5, 5),))
 
+    @torch.no_grad()
+    def test_feature_cells_that_are_alike_are_merged(self):
+        """A bare stop on 92 x 92 cells has the PSFs of one on 23 x 23, to the tolerance of the integrals."""
+        lens = Lens.from_seidel(50e-3, 17.6, 0.595, 7e-3, astigmatism=2.0, field_curvature=-4.0)
+        given = Spectrum.monochrome(), [1.0], [-20.0, 3.0], [(300.0, 400.0)], lens, 8e-6, 33, 1e-3
+        few = field_psf_bank(torch.zeros(1, 23, 23), torch.ones(1), Pupil(torch.ones(23, 23), 0.1), *given)
+        many = field_psf_bank(torch.zeros(1, 92, 92), torch.ones(1), Pupil(torch.ones(92, 92), 0.025), *given)
+        assert torch.equal(few.psfs, many.psfs)
+        one = torch.zeros(1, 92, 92)
+        one[0, 40, 50] = 1e-9  # not alike
+        each = field_psf_bank(one, torch.ones(1), Pupil(torch.ones(92, 92), 0.025), *given)
+        assert not torch.equal(each.psfs, many.psfs)
+        assert float((each.psfs - many.psfs).norm() / many.psfs.norm()) < 1e-3
+
     def test_smoke_a_camera_with_the_name_of_a_lens(self):
         optics = TiDyOptics(PixelwiseMask(2), lens="single-50mm", fidelity="draft")
         bank = optics.psf_bank(defocus=[-5.0, 5.0], field=[(0, 0), (500, 600), (-20, 3)])

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from kornia_tidy.camera.tidy_optics import TiDyOptics
 
 COLUMNS = 7
-CELLS = 23  # of a pupil without masks that a lens's own stop cuts: as good as more, and faster
 
 
 def depths_of(text: str) -> tuple[float, ...]:
@@ -166,7 +165,7 @@ class Psf:
             raise ValueError(f"{name} has a lens of its own: --focal-length and the like are for files of masks alone")
         camera, lens = camera_and_lens(self.lens, self.settings)
         if name is None:
-            optics = TiDyOptics(NoMask(CELLS), camera, fidelity=fidelity, lens=lens)
+            optics = TiDyOptics(NoMask(), camera, fidelity=fidelity, lens=lens)
         elif name in SYSTEMS:
             other = {} if lens is None else {"camera": camera, "lens": lens}
             generator.manual_seed(self.mask_seed)
