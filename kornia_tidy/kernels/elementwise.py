@@ -1,4 +1,4 @@
-"""Calls of C functions that compute each number of a tensor from the numbers in the same place of others."""
+"""Operators in C that compute each number of a tensor from the numbers in the same place of others."""
 
 from __future__ import annotations
 
@@ -8,6 +8,57 @@ from typing import Any
 
 import torch
 from torch import Tensor
+
+from kornia_tidy.kernels.build import REALS
+from kornia_tidy.kernels.operators import define
+
+
+def define_elementwise(
+    name: str, schema: str, tensors: int, call: Callable[..., Tensor], by_torch: Callable[..., Tensor]
+) -> None:
+    """Define an operator ``kornia_tidy::<name>`` of a first tensor, with its gradient ``kornia_tidy::<name>_gradient``.
+
+    Args:
+        name: of the operator.
+        schema: its arguments. The first is a tensor; the gradient's operator has that of its result after it.
+        tensors: how many arguments are tensors; they come first. Gradients reach the first.
+        call: fills the memory of the result, which comes first, from the first tensor, the gradient of the result or
+            None, and all other arguments.
+        by_torch: the same by plain operations, of the operator's arguments, to differentiate the gradient in turn.
+    """
+    first, _, rest = schema.partition(", ")
+    of_gradient = f"{name}_gradient"
+
+    def new(x: Tensor, *given: Any) -> Tensor:
+        """Check the arguments and return the memory of the result, which is also the fake implementation."""
+        if x.dtype not in REALS:
+            raise TypeError(f"{first.split()[1]} must be float32 or float64, got {x.dtype}")
+        for field in given:
+            if isinstance(field, Tensor) and (field.dtype, field.shape) != (x.dtype, x.shape):
+                raise ValueError(
+                    f"fields must be {x.dtype} of shape {tuple(x.shape)} as the {first.split()[1]}, got {field.dtype} "
+                    f"of shape {tuple(field.shape)}"
+                )
+        return torch.empty_like(x)
+
+    def gradient_of(x: Tensor, gradient: Tensor, *given: Any) -> Tensor:
+        return call(new(x, gradient, *given), x, gradient, *given)
+
+    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs[:tensors])
+        ctx.options = inputs[tensors:]
+
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, *fields = ctx.saved_tensors
+        given = *fields, *ctx.options
+        if not torch.is_grad_enabled():
+            return getattr(torch.ops.kornia_tidy, of_gradient)(x, gradient, *given), *[None] * len(given)
+        own = x.view_as(x)  # the gradient is differentiated in turn
+        return *torch.autograd.grad(by_torch(own, *given), own, gradient, create_graph=True), *[None] * len(given)
+
+    schemas = f"({schema}) -> Tensor", f"({first}, Tensor gradient, {rest}) -> Tensor"
+    define(name, schemas[0], lambda x, *given: call(new(x, *given), x, None, *given), new, backward, keep)
+    define(of_gradient, schemas[1], gradient_of, new)
 
 
 def call_elementwise(

@@ -17,15 +17,11 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.kernels.elementwise import call_elementwise
+from kornia_tidy.kernels.elementwise import call_elementwise, define_elementwise
 from kornia_tidy.kernels.shot_noise import drawn_electrons
 from kornia_tidy.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "sensor.c"
-_GIVEN = "Tensor? shot, Tensor? read, Tensor? offset, float full_well, float dark, float sigma, int bits, bool clip"
-
-torch.library.define("kornia_tidy::record", f"(Tensor light, {_GIVEN}) -> Tensor")
-torch.library.define("kornia_tidy::record_gradient", f"(Tensor light, Tensor gradient, {_GIVEN}) -> Tensor")
 
 
 def record(
@@ -102,49 +98,11 @@ def quantized(value: Tensor, bits: int) -> Tensor:
 # ---------------------------------------------------------------------- the operator
 
 
-def _record(light: Tensor, *given: Any) -> Tensor:
-    return _call(_new(light, *given), light, None, *given)
-
-
-def _record_gradient(light: Tensor, gradient: Tensor, *given: Any) -> Tensor:
-    return _call(_new(light, gradient, *given), light, gradient, *given)
-
-
 def _call(out: Tensor, light: Tensor, gradient: Tensor | None, *given: Any) -> Tensor:
     *fields, full_well, dark, sigma, bits, clip = given
     numbers = full_well, dark, sigma, 2**bits - 1, clip
     return call_elementwise(load(SOURCE, out.dtype).record, out, (light, gradient, *fields), *numbers)
 
 
-def _new(light: Tensor, *given: Any) -> Tensor:
-    """Check the arguments and return the memory of the result, which is also the fake implementation."""
-    if light.dtype not in REALS:
-        raise TypeError(f"light must be float32 or float64, got {light.dtype}")
-    for field in given:
-        if isinstance(field, Tensor) and (field.dtype, field.shape) != (light.dtype, light.shape):
-            raise ValueError(
-                f"fields must be {light.dtype} of shape {tuple(light.shape)} as the light, got {field.dtype} of shape "
-                f"{tuple(field.shape)}"
-            )
-    return torch.empty_like(light)
-
-
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:4])
-    ctx.options = inputs[4:]
-
-
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    light, *fields = ctx.saved_tensors
-    given = *fields, *ctx.options
-    if not torch.is_grad_enabled():
-        return torch.ops.kornia_tidy.record_gradient(light, gradient, *given), *[None] * len(given)
-    own = light.view_as(light)  # the gradient is differentiated in turn
-    return *torch.autograd.grad(_by_torch(own, *given), own, gradient, create_graph=True), *[None] * len(given)
-
-
-torch.library.impl("kornia_tidy::record", "CPU", _record)
-torch.library.register_fake("kornia_tidy::record", _new)
-torch.library.register_autograd("kornia_tidy::record", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::record_gradient", "CPU", _record_gradient)
-torch.library.register_fake("kornia_tidy::record_gradient", _new)
+_GIVEN = "Tensor? shot, Tensor? read, Tensor? offset, float full_well, float dark, float sigma, int bits, bool clip"
+define_elementwise("record", f"Tensor light, {_GIVEN}", 4, _call, _by_torch)

@@ -7,27 +7,20 @@ r"""Decoding and encoding of sRGB: operators in C for processors, and kornia's f
 
 Values above 1 go by the power, negative ones by the line. Up to 1 the operators are at most 2e-7 off in float32.
 
-Operators are defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
-
 Source: IEC 61966-2-1.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.kernels.elementwise import call_elementwise
+from kornia_tidy.kernels.elementwise import call_elementwise, define_elementwise
 from kornia_tidy.mode import Mode, torch_mode
 
 SOURCE = KERNELS / "srgb.c"
-
-torch.library.define("kornia_tidy::srgb", "(Tensor image, bool encode) -> Tensor")
-torch.library.define("kornia_tidy::srgb_gradient", "(Tensor image, Tensor gradient, bool encode) -> Tensor")
 
 
 def srgb_to_linear(image: Tensor) -> Tensor:
@@ -78,43 +71,8 @@ def _by_torch(image: Tensor, encode: bool) -> Tensor:
     return function(image.reshape(1, -1, 1).expand(3, -1, -1))[0].reshape(image.shape)
 
 
-def _srgb(image: Tensor, encode: bool) -> Tensor:
-    out = _new(image)
-    return call_elementwise(load(SOURCE, out.dtype).convert, out, (image, None), encode)
-
-
-def _srgb_gradient(image: Tensor, gradient: Tensor, encode: bool) -> Tensor:
-    out = _new(image, gradient)
+def _call(out: Tensor, image: Tensor, gradient: Tensor | None, encode: bool) -> Tensor:
     return call_elementwise(load(SOURCE, out.dtype).convert, out, (image, gradient), encode)
 
 
-def _new(image: Tensor, gradient: Tensor | None = None) -> Tensor:
-    """Check the arguments and return the memory of the result, which is also the fake implementation."""
-    if image.dtype not in REALS:
-        raise TypeError(f"image must be float32 or float64, got {image.dtype}")
-    if gradient is not None and (gradient.dtype, gradient.shape) != (image.dtype, image.shape):
-        raise ValueError(
-            f"gradient must be {image.dtype} of shape {tuple(image.shape)} as the image, "
-            f"got {gradient.dtype} of shape {tuple(gradient.shape)}"
-        )
-    return torch.empty_like(image)
-
-
-def _keep(ctx: Any, inputs: tuple[Tensor, bool], output: Tensor) -> None:
-    image, ctx.encode = inputs
-    ctx.save_for_backward(image)
-
-
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-    (image,) = ctx.saved_tensors
-    if not torch.is_grad_enabled():
-        return torch.ops.kornia_tidy.srgb_gradient(image, gradient, ctx.encode), None
-    own = image.view_as(image)  # the gradient is differentiated in turn
-    return *torch.autograd.grad(_by_torch(own, ctx.encode), own, gradient, create_graph=True), None
-
-
-torch.library.impl("kornia_tidy::srgb", "CPU", _srgb)
-torch.library.register_fake("kornia_tidy::srgb", lambda image, encode: _new(image))
-torch.library.register_autograd("kornia_tidy::srgb", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::srgb_gradient", "CPU", _srgb_gradient)
-torch.library.register_fake("kornia_tidy::srgb_gradient", lambda image, gradient, encode: _new(image, gradient))
+define_elementwise("srgb", "Tensor image, bool encode", 1, _call, _by_torch)

@@ -57,7 +57,7 @@ class TestSRGBGradient(OperatorTester):
         return torch.ops.kornia_tidy.srgb_gradient(torch.zeros(1), torch.zeros(1), False)
 
     def test_exception(self):
-        with pytest.raises(ValueError, match=r"gradient must be .*32 of shape \(2,\) as the image, got .*64 of"):
+        with pytest.raises(ValueError, match=r"fields must be .*32 of shape \(2,\) as the image, got .*64 of"):
             torch.ops.kornia_tidy.srgb_gradient(torch.zeros(2), torch.zeros(1).double(), False)
 
 
