@@ -1,3 +1,3 @@
 """Version of the package, which ``__init__.py`` exports; lower packages read it here."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
+from PIL import Image
 
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
@@ -242,6 +243,15 @@ class TestEveryPage(BaseTester):
         namespace = runpy.run_path(str(script))
         path = namespace["main"](["--size", "64", "--output", str(tmp_path / "new" / "camera.png")])
         assert read_image(path).shape == read_image(namespace["PICTURE"]).shape
+        assert namespace["PICTURE"].stat().st_size < 300_000
+
+    @pytest.mark.takes_seconds
+    def test_feature_the_animation_of_the_documentation_is_drawn(self, tmp_path):
+        namespace = runpy.run_path(str(ROOT / "docs" / "make_animation.py"))
+        path = namespace["main"](["--size", "72", "--output", str(tmp_path / "new" / "exposure.webp")])
+        with Image.open(path) as drawn, Image.open(namespace["PICTURE"]) as shipped:
+            assert drawn.n_frames > 30
+            assert (drawn.size, drawn.n_frames) == (shipped.size, shipped.n_frames)
         assert namespace["PICTURE"].stat().st_size < 300_000
 
     def test_feature_the_readme_is_short(self):

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+import kornia_tidy
 from tests.base import BaseTester
 
-PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 class TestMetadata(BaseTester):
@@ -19,6 +21,10 @@ class TestMetadata(BaseTester):
         assert [author["name"] for author in PROJECT["authors"]] == ["The kornia_tidy authors"]
         assert set(PROJECT["urls"]) == {"Paper"}  # the repository has no public address that was confirmed
         assert all(address.startswith("https://") for address in PROJECT["urls"].values())
+
+    def test_smoke_the_citation_is_of_this_version(self):
+        lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+        assert f"version: {kornia_tidy.__version__}" in lines
 
     def test_smoke_the_package_runs_as_the_command(self, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["kornia_tidy", "--version"])

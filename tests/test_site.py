@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import pkgutil
 import re
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -114,6 +116,34 @@ class TestApiPages(BaseTester):
         assert not there & set(api_pages.LEFT_OUT)
         index = (tmp_path / "api" / "index.rst").read_text(encoding="utf-8")
         assert [name for name in kornia_tidy.__all__ if f"{name}`" not in index] == []
+
+    def test_feature_each_public_name_is_on_one_page(self, tmp_path):
+        """As Sphinx writes the pages: a package's list of names, and single names of modules."""
+        root = SITE.parents[1]
+        given = [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "examples").glob("*.py")]
+        api_pages.write_api_pages(tmp_path / "api", given)
+        homes = [api_pages.home(name) for name in kornia_tidy.__all__]
+        places = defaultdict(list)
+        for path in (tmp_path / "api").glob("*.rst"):
+            text = path.read_text(encoding="utf-8")
+            for name, listed in re.findall(r"automodule:: (\S+)\n(   :imported-members:)?", text):
+                own = [home for home in homes if home.rpartition(".")[0] == name]
+                exported = getattr(importlib.import_module(name), "__all__", ()) if listed else ()
+                for public in {*own, *(f"{name}.{public}" for public in exported)}:
+                    places[public].append(path.stem)
+            for module, name in re.findall(r"auto(?:class|function|data):: (\S+)::(\S+)", text):
+                places[f"{module}.{name}"].append(path.stem)
+        packages = [info.name for info in pkgutil.walk_packages(kornia_tidy.__path__, "kornia_tidy.") if info.ispkg]
+        public = {
+            f"{package}.{name}"
+            for package in packages
+            if package.split(".")[1] not in api_pages.LEFT_OUT
+            for name in getattr(importlib.import_module(package), "__all__", ())
+        }
+        assert len(public) > 100
+        assert {name: places[name] for name in public if len(places[name]) != 1} == {}
+        assert {name: pages for name, pages in places.items() if len(pages) > 1} == {}
+        assert [name for name in homes if len(places[name]) != 1] == []
 
     @pytest.mark.parametrize(
         ("text", "expected"),

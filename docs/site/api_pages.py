@@ -10,8 +10,8 @@ from pathlib import Path
 
 import kornia_tidy
 
-WHOLE = ("inference", "training")  # they export nothing by themselves: their modules are imported by name
-LEFT_OUT = ("commands", "kernels", "runtime", "figures")  # not for import, but by the command line
+WHOLE = ("training",)  # it exports nothing by itself: its modules are imported by name
+LEFT_OUT = ("cli", "kernels", "figures")  # not for import, but by the command line
 ADAPTERS = ("albumentations_v2", "arrays", "deepinv_physics", "torchvision_v2")
 IMPORT = re.compile(r"^\s*from (kornia_tidy(?:\.\w+)*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
@@ -68,10 +68,11 @@ def package_page(package: str, wanted: dict[str, set[str]]) -> str:
     lines = [title, "=" * len(title), "", *automodule(package)]
     module = importlib.import_module(package)
     exported = set(getattr(module, "__all__", ()))
-    for info in pkgutil.iter_modules(getattr(module, "__path__", ()), f"{package}."):
+    for info in pkgutil.walk_packages(getattr(module, "__path__", ()), f"{package}.", onerror=lambda _: None):
         short = info.name.rpartition(".")[2]
         names = sorted(wanted.get(info.name, set()) - exported)
-        if info.ispkg or title in WHOLE or short in ADAPTERS:
+        whole = title in WHOLE and info.name.rpartition(".")[0] == package
+        if info.ispkg or whole or short in ADAPTERS:
             part = automodule(info.name)
         elif names:
             part = [line for name in names for line in described(info.name, name)]

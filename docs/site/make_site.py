@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def copy_pages(source: Path) -> list[Path]:
     """Copy pages and their link targets in the repository, so that links hold, and drop files that are gone from it."""
     listed = [ROOT / name for name in PAGES] + [
-        path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg"}
+        path for path in (ROOT / "docs").rglob("*") if path.suffix in {".md", ".png", ".jpg", ".svg", ".webp"}
     ]
     pages = [path for path in listed if path.suffix == ".md"]
     linked = {(page.parent / target).resolve() for page in pages for target in LINK.findall(page.read_text())}

@@ -57,9 +57,9 @@ class NoisyCrops(Dataset):
         Items are mappings of
 
         - ``"coded"``: the capture (3, H, W), and ``"image"``: the all-in-focus image, both encoded as the camera does;
-        - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True at known depths; - ``"noise"``: (3, H,
-        W), standard deviation of the noise in linear light, full scale 1, by the sensor's model and the noisy capture,
-        as for a capture of an unknown scene; in training wrong by a factor, see
+        - ``"inverse_depth"`` (1, H, W), normalised; ``"mask"`` (1, H, W), True at known depths;
+        - ``"noise"``: (3, H, W), standard deviation of the noise in linear light, full scale 1, by the sensor's model
+          and the noisy capture, as for a capture of an unknown scene; in training wrong by a factor, see
           :func:`random_error`.
 
     Source: Foi et al., Practical Poissonian-Gaussian noise modeling (TIP 2008), for the noise; training over a range of
