@@ -2,9 +2,8 @@
 
     python docs/make_animation.py
 
-One exposure through the five masks of the trained system "edof-designed": each mask in turn, its PSF while the depth of a
-point is pulled from near to far, the average of the PSFs so far, and the light that the sensor has collected. At the
-end the network's restoration.
+One exposure through the five masks of the trained system "edof-designed": each mask in turn, its PSF from near to far,
+the average of the PSFs so far, and the light that the sensor has collected. At the end the restoration of the network.
 """
 
 from __future__ import annotations
