@@ -56,7 +56,7 @@ html_css_files = ["site.css"]
 html_show_sphinx = False
 html_theme_options = {
     "navigation_with_keys": True,
-    "top_of_page_buttons": [],  # pages of the gallery and the reference are made: there is not a source to view or edit
+    "top_of_page_buttons": [],  # pages of the gallery and the reference are generated and have no source to edit
 }
 copybutton_prompt_text = r">>> |\.\.\. "
 copybutton_prompt_is_regexp = True

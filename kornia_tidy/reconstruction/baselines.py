@@ -270,7 +270,7 @@ def load_depth_anything_v2(name_or_folder: str | os.PathLike[str], **options: An
     Raises:
         ImportError: if transformers is missing.
         ValueError: if weights are missing from the files.
-        OSError: if the folder is missing or repository.
+        OSError: if the folder or repository is missing.
     """
     return _depth_anything(_load("DepthAnythingForDepthEstimation", name_or_folder, options)).eval()
 
@@ -288,7 +288,7 @@ def load_zoedepth(name_or_folder: str | os.PathLike[str], **options: Any) -> Mon
     Raises:
         ImportError: if transformers is missing.
         ValueError: if weights are missing from the files.
-        OSError: if the folder is missing or repository.
+        OSError: if the folder or repository is missing.
     """
     return _zoedepth(_load("ZoeDepthForDepthEstimation", name_or_folder, options)).eval()
 

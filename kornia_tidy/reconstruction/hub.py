@@ -134,7 +134,7 @@ def from_pretrained(
         The system in eval mode, on the CPU, with the record of its training. The sensor keeps its noise.
 
     Raises:
-        FileNotFoundError: if the folder is missing or file, and the name is not that of a repository.
+        FileNotFoundError: if the folder or file is missing, and the name is not that of a repository.
         ImportError: if a repository is asked for and huggingface_hub is missing.
         OSError: if a repository or its files cannot be downloaded.
         ValueError: if files are damaged, or weights and settings do not fit; the message names the difference.

@@ -65,7 +65,7 @@ class SimulateRaw:
     Args:
         output: DNG to write.
         image: picture: PNG, JPEG, TIFF or NPY. None: another target.
-        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR. None: there is not a picture.
+        depth: of the picture: PNG, TIFF, PGM, PFM, NPY, OpenEXR. None: none.
         flat: instead: an evenly lit sheet, of full scale; 0: the lens cap. None: another target.
         points: instead: points of light in a sheet. None: another target.
         distance: of the points. None: there are no points.

@@ -232,7 +232,7 @@ def known_rows(folder: str | os.PathLike[str], conditions: Conditions) -> tuple[
     """Return the rows of an earlier run in a folder that are still valid, and a remark about them.
 
     Raises:
-        ValueError: if ``trade.json`` there is not a sweep.
+        ValueError: if its ``trade.json`` does not hold a sweep.
     """
     path = Path(folder) / "trade.json"
     if not path.exists():

@@ -88,7 +88,7 @@ def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptatio
         adaptation: a transform of colour-science: ``"Bradford"``, ``"CAT02"``, ``"CAT16"`` or ``"Von Kries"``.
 
     Raises:
-        ValueError: if there is not a such transform, or the factors give an illuminant with a negative XYZ.
+        ValueError: if the transform is unknown, or the factors give an illuminant with a negative XYZ.
 
     Example:
         >>> matrix, daylight = torch.eye(3), torch.ones(3)

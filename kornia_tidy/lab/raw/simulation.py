@@ -67,7 +67,7 @@ def simulated_sensor(pattern: str = "RGGB", bits: int = 12, black: float | None 
         black: count without light. Default: 2^bits / 16.
 
     Raises:
-        ValueError: if there is not a such filter array, or black is not below white.
+        ValueError: if the filter array is unknown, or black is not below white.
 
     Example:
         >>> sensor = simulated_sensor("GBRG", bits=14)

@@ -32,7 +32,7 @@ def load_pretrained(name: str) -> TrainedSystem:
         task; :func:`~kornia_tidy.reconstruction.tasks.split_maps` returns them by name.
 
     Raises:
-        ValueError: if there is not a system of this name.
+        ValueError: if no system has this name.
 
     Example:
         >>> import torch

@@ -21,7 +21,7 @@ def capture_variance(signal: Tensor, sensor: SensorNoise) -> Tensor:
 
     Args:
         signal: s, mean values without noise, 1 at full scale.
-        sensor: noise parameters. Without a full well there is not a shot noise.
+        sensor: noise parameters. Without a full well shot noise is left out.
 
     Returns:
         Variance in units of full scale squared, the shape of ``signal``.

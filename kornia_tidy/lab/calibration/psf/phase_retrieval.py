@@ -271,7 +271,7 @@ class _Model:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Move the defocus offset to the nodes, where it is exact, if it is not a longer small."""
+        """Move the defocus offset to the nodes, where it is exact, if it is no longer small."""
         if abs(float(self.offset)) > 0.25:
             self.centre += float(self.offset)
             self.offset.zero_()
