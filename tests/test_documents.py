@@ -254,6 +254,13 @@ class TestEveryPage(BaseTester):
             assert (drawn.size, drawn.n_frames) == (shipped.size, shipped.n_frames)
         assert namespace["PICTURE"].stat().st_size < 300_000
 
+    @pytest.mark.parametrize("name", [n for n in NAMES if n.startswith("docs/") and "/record/" not in n])
+    def test_feature_a_page_begins_with_its_use(self, name):
+        """Lists of pages begin with what they list."""
+        opening = (ROOT / name).read_text(encoding="utf-8").split("\n\n")[1].replace("\n", " ")
+        lists = ("This page lists", "Each guide takes you")
+        assert opening.startswith(("After this page you ", *lists)), opening
+
     def test_feature_the_readme_is_short(self):
         assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 200
 
