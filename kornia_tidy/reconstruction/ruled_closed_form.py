@@ -24,7 +24,7 @@ from kornia_tidy.render.borders import next_fast_size
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
 CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
-COLOR, COLOR_EXPONENT = 3.2, 0.76  # of the width in colour, by the noise that the filter leaves
+COLOR, SCENE_SHARE = 5.3, 0.3  # of the width in colour by the predicted error; share of the scene's part that counts
 CONTENT = (0.03, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
 LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the scene
 STEPS = 20  # places between two kernels among which the best is sought
@@ -45,12 +45,13 @@ class RuledClosedForm(ClosedForm):
     S is the power spectrum of photographs, and r this scene's share of it: the power of differences between
     neighbouring pixels of the capture, less that of noise, over the one that photographs would have behind this camera;
     between .03 and 4. Kernels are of bounded size, so a PSF that fills its window is inverted less sharply. The width c
-    of the bilateral filter in colour follows the standard deviation of the noise that the kernel leaves:
+    of the bilateral filter in colour follows the predicted error, of which the filter takes noise well and what the
+    kernel left of the scene less:
 
-    .. math:: c = 3.2 \, (\sigma \lVert k \rVert_2)^{0.76}
+    .. math:: c = 5.3 \, \sqrt{\sigma^2 \lVert k \rVert_2^2 + 0.3 \, r \int S \, \langle |1 - K H|^2 \rangle \, df}
 
-    Its two numbers were fitted on painted scenes behind the training cameras of ``tests/benchmarks/any_camera``, which
-    says how near the rule comes to the best choice behind each: ``python -m tests.benchmarks.any_camera rule FOLDER``.
+    The form was found on painted scenes behind the training cameras of ``tests/benchmarks/any_camera``, its two numbers
+    on six real scenes of half A. ``docs/record`` says how near it comes to the best choice behind each camera.
 
     Args:
         layers: number of depths with a deconvolution of the brightness for each, as inputs of a network.
@@ -117,23 +118,25 @@ class RuledClosedForm(ClosedForm):
         return restored._replace(maps=torch.cat(maps, 1))
 
     def _place(self, level: Tensor, light: Tensor) -> Tensor:
-        return self._best_place(10 ** level[:, :1, :1, :1], light)
+        return self._best(10 ** level[:, :1, :1, :1], light)[0]
 
     def _color(self, noise: Tensor, light: Tensor) -> Tensor:
-        even = noise[:, :1, :1, :1].clamp(min=LEAST_NOISE)
-        return COLOR * self._left(even, self._best_place(even, light)) ** COLOR_EXPONENT
+        _, scene, left = self._best(noise[:, :1, :1, :1].clamp(min=LEAST_NOISE), light)
+        return COLOR * (left + SCENE_SHARE * scene).sqrt()
 
-    def _best_place(self, noise: Tensor, light: Tensor) -> Tensor:
-        """Return the place of the kernel with the least predicted error, (B, 1, 1, 1)."""
+    def _best(self, noise: Tensor, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the place of the kernel with the least predicted error, and both parts of it, all (B, 1, 1, 1)."""
         detail = light_detail(light) if self.detail is None else self.detail.to(light)
         variance = noise.flatten().square()
         power = (detail - 2 * variance).clamp(min=LEAST_DETAIL * variance)
         content = (power / self.photographs_detail.to(light)).clamp(*CONTENT)
         logs = torch.stack([self.scene_errors, self.norms.square()]).clamp(min=1e-12).log().double()
         curve = _cubic(len(self.norms), STEPS).to(logs.device)
-        scene, left = (curve @ logs[0]).exp(), (curve @ logs[1]).exp()
-        errors = content[:, None] * scene.to(light) + variance[:, None] * left.to(light)
-        return (errors.argmin(1) / STEPS).to(light)[:, None, None, None]
+        scene = content[:, None] * (curve @ logs[0]).exp().to(light)
+        left = variance[:, None] * (curve @ logs[1]).exp().to(light)
+        best = (scene + left).argmin(1, keepdim=True)
+        parts = (best / STEPS, scene.gather(1, best), left.gather(1, best))
+        return tuple(part.to(light)[:, :, None, None] for part in parts)  # ty: ignore[invalid-return-type]
 
     def _left(self, noise: Tensor, place: Tensor) -> Tensor:
         """Return the standard deviation of the noise that a kernel leaves of even noise, all (B, 1, 1, 1)."""

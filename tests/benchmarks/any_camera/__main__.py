@@ -7,27 +7,42 @@ from pathlib import Path
 
 import torch
 
+from kornia_tidy.data.photo_collages import photographs_in
+from kornia_tidy.reconstruction.any_camera import WEIGHTS
 from tests.benchmarks.any_camera.cameras import POOLS
-from tests.benchmarks.any_camera.captures import photograph
+from tests.benchmarks.any_camera.captures import photograph, photograph_collages
 from tests.benchmarks.any_camera.closed_form import sweep
-from tests.benchmarks.any_camera.training import train
+from tests.benchmarks.any_camera.guards import measure
+from tests.benchmarks.any_camera.scores import averaged, mixed, score_pool
+from tests.benchmarks.any_camera.training import ship, start, train
 
 
 def main() -> None:
     """Run one step."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("step", choices=("photograph", "sweep", "train"))
+    parser.add_argument("step", choices=("photograph", "sweep", "train", "closed-forms", "score", "guards", "ship"))
     parser.add_argument("folder", type=Path, help="of captures, checkpoints and scores; a step goes on where it ended")
     parser.add_argument("--pool", choices=tuple(POOLS), default="training")
+    parser.add_argument("--photographs", type=Path, help="folder, for collages")
+    parser.add_argument("--share", type=float, default=0.0, help="of the start's weights in those that are shipped")
     parser.add_argument("--steps", type=int, default=2400)
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.step == "photograph":
-        photograph(options.folder / "captures", options.pool)
+        if options.photographs is None:
+            photograph(options.folder / "captures", options.pool)
+        else:
+            photograph_collages(options.folder / "captures", photographs_in(options.photographs))
     elif options.step == "sweep":
         sweep(options.folder, options.pool)
-    else:
+    elif options.step == "train":
         train(options.folder, options.steps)
+    elif options.step == "guards":
+        measure(options.folder)
+    elif options.step == "ship":
+        ship(mixed(averaged(options.folder), start().network.state_dict(), options.share), WEIGHTS)
+    else:
+        score_pool(options.folder, options.pool, closed_forms=options.step == "closed-forms")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.data.photo_collages import grain
+from kornia_tidy.data.photo_collages import grain, photo_collage
 from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.seeds import keyed_seed
@@ -74,12 +75,32 @@ def stored(folder: Path, name: str, scenes: int | None = None) -> Captures:
             seen.append(photographed(optics, scene, near))
             shown.append(rgb_to_linear_rgb(scene[None])[0])
         folder.mkdir(parents=True, exist_ok=True)
-        for path, part in ((image, shown), (light, seen)):
-            values = (torch.stack(part) * LEVELS).round().numpy().astype(np.uint16)
-            with open(partial := path.with_suffix(".partial"), "wb") as file:
-                np.save(file, values)
-            partial.rename(path)
+        _write({image: shown, light: seen})
     return Captures(np.load(light, mmap_mode="r"), np.load(image, mmap_mode="r"))
+
+
+def photograph_collages(folder: Path, photographs: Sequence[str], scenes: int = 10) -> None:
+    """Make captures of collages of photographs by the cameras of training; of the shipped ones more."""
+    for name in pool_names("training"):
+        light, image = (folder / f"{name}-collages-{part}.npy" for part in ("light", "image"))
+        if light.exists():
+            continue
+        optics, seen, shown = camera(name), [], []
+        for index in range(3 * scenes if name in SHIPPED else scenes):
+            seed = keyed_seed(f"{name} collages", index)
+            scene, depth = photo_collage(photographs, SIDE, SIDE, depth_range=(1.0, float("inf")), seed=seed)
+            seen.append(photographed(optics, scene, 1 / depth))
+            shown.append(rgb_to_linear_rgb(scene[None])[0])
+        _write({image: shown, light: seen})
+
+
+def _write(parts: Mapping[Path, list[Tensor]]) -> None:
+    """Write pictures in linear light, so that no file is half there."""
+    for path, part in parts.items():
+        values = (torch.stack(part) * LEVELS).round().numpy().astype(np.uint16)
+        with open(partial := path.with_suffix(".partial"), "wb") as file:
+            np.save(file, values)
+        partial.rename(path)
 
 
 def photograph(folder: Path, pool: str, scenes: int | None = None) -> None:

@@ -11,17 +11,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb
+from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 from torch.nn import functional
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.data.photo_collages import grain
 from kornia_tidy.files import write_bytes
 from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera
 from kornia_tidy.reconstruction.eight_bits import in_eight_bits
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED, RuledClosedForm
 from kornia_tidy.reconstruction.state_file import write_state
@@ -49,8 +51,11 @@ SAVED_EVERY = 100  # steps
 
 OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
 MISTAKEN, MISTAKES = 0.35, 2  # share of draws with PSFs of a camera that is a little different; kinds of each camera
-LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors of pitch and aperture; of the mask in pupils; of focus in radians
+LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors of pitch and aperture; of the mask in radii of the pupil; of focus in radians
 DEMOSAICED = 0.2  # share of draws behind a Bayer filter
+GRAINY = 0.4  # share of draws whose scene has grain, which the optics blur and a network should keep
+COLLAGES = 0.5  # share of draws of collages of photographs, where there are any
+PULL = 3e-4  # of the weights towards those of the start, for each step at the full rate
 
 
 class Cameras:
@@ -71,7 +76,9 @@ class Cameras:
 
     def crops(self, name: str, count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return noise-free crops of captures and scenes in linear light."""
-        captures = stored(self.folder, name)
+        collages = self.folder / f"{name}-collages-light.npy"
+        drawn = float(torch.rand((), generator=random)) < COLLAGES and collages.exists()
+        captures = stored(self.folder, f"{name}-collages" if drawn else name)
         side, found = captures.light.shape[-1], []
         for _ in range(count):
             index = int(torch.randint(len(captures.light), (), generator=random))
@@ -99,17 +106,19 @@ def mistaken(optics: TiDyOptics, seed: int) -> TiDyOptics:
     )
     masks = optics.masks
     if not isinstance(masks, NoMask):
-        heights = masks.heights().detach()
-        shift = 2 * SHIFT / MASK_SPAN * torch.tensor([across, down])  # of the sides, in units of half of them
-        grid = functional.affine_grid(
-            torch.cat([torch.eye(2), shift[:, None]], 1).expand(len(heights), 2, 3),
-            [len(heights), 1, *heights.shape[-2:]],
-            align_corners=False,
-        ).to(heights)
-        masks = PixelwiseMask(
-            initial=functional.grid_sample(heights[:, None], grid, padding_mode="border", align_corners=False)[:, 0]
-        )
+        masks = PixelwiseMask(initial=shifted(masks.heights(), SHIFT * down, SHIFT * across))
     return TiDyOptics(masks, other, fidelity=optics.fidelity, sensor=None).requires_grad_(requires_grad=False)
+
+
+def shifted(heights: Tensor, down: float, across: float) -> Tensor:
+    """Return heights (K, N, N) of masks that are moved by parts of the pupil's radius."""
+    shift = 2 / MASK_SPAN * torch.tensor([across, down])  # a side is 2 wide here, and MASK_SPAN radii
+    grid = functional.affine_grid(
+        torch.cat([torch.eye(2), shift[:, None]], 1).expand(len(heights), 2, 3),
+        [len(heights), 1, *heights.shape[-2:]],
+        align_corners=False,
+    ).to(heights)
+    return functional.grid_sample(heights.detach()[:, None], grid, padding_mode="border", align_corners=False)[:, 0]
 
 
 def drawn_sensor(random: torch.Generator) -> SensorNoise:
@@ -119,6 +128,15 @@ def drawn_sensor(random: torch.Generator) -> SensorNoise:
     bits = BITS[int(torch.randint(len(BITS), (), generator=random))]
     read = READ_ELECTRONS[0] * (READ_ELECTRONS[1] / READ_ELECTRONS[0]) ** read
     return SensorNoise(read / electrons, full_well=electrons, bits=bits)
+
+
+def with_grain(light: Tensor, image: Tensor, form: RuledClosedForm, random: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Return captures and scenes with grain of the scene, blurred by the mean PSF in the captures."""
+    rng = np.random.default_rng(int(torch.randint(2**31, (), generator=random)))
+    drawn = torch.stack([torch.from_numpy(grain(*image.shape[-2:], rng)) for _ in image])
+    grainy = rgb_to_linear_rgb((linear_rgb_to_rgb(image) + drawn).clamp(0, 1))
+    blurred = convolve_kernels(grainy - image, form.psfs.mean(0)[None])[:, 0]
+    return (light + blurred).clamp(0, 1), grainy
 
 
 def demosaiced(light: Tensor) -> Tensor:
@@ -143,10 +161,12 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         names = SHIPPED if shipped else cameras.names[len(SHIPPED) :]
         name = names[int(torch.randint(len(names), (), generator=random))]
         light, image = cameras.crops(name, CROPS_A_CAMERA, random)
-        chance = torch.rand(4, generator=random, dtype=torch.float64).tolist()
+        chance = torch.rand(5, generator=random, dtype=torch.float64).tolist()
         gain = random_gain(torch.maximum(light.amax((0, 2, 3)), image.amax((0, 2, 3))))
         if chance[0] < OVEREXPOSED:
             gain = gain * 4 ** (chance[0] / OVEREXPOSED)
+        if chance[4] < GRAINY:
+            light, image = with_grain(light, image, cameras.form(name), random)
         sensor = drawn_sensor(random)
         noisy = sensor(light * gain, generator=random)
         told = sensor.std(noisy) * NOISE_ERROR ** (2 * chance[1] - 1)
@@ -174,6 +194,9 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
     """Train; goes on from the checkpoint in the folder, and ends after so many steps or minutes."""
     cameras, path = Cameras(folder / "captures", "training"), folder / "checkpoint.pt"
     network = start().network.train().to(memory_format=torch.channels_last)
+    anchor = [part.detach().clone() for part in network.parameters()]
+    if (first := folder / "first.pt").exists():
+        network.load_state_dict(torch.load(first, weights_only=True))
     average = MovingAverage(network, DECAY)
     optimizer = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=0.0)
     step, log = 0, []
@@ -195,6 +218,9 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
+        with torch.no_grad():
+            for part, origin in zip(network.parameters(), anchor, strict=True):
+                part.lerp_(origin, PULL * group["lr"] / RATE)
         average.update(network)
         step += 1
         with torch.no_grad():

@@ -1,0 +1,96 @@
+"""What captures lose that are not as the camera should take them, restored by the network for any camera."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from torch import Tensor
+
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.files import write_bytes
+from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.reconstruction.capture_checks import check_capture
+from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED
+from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.reconstruction.trained import any_camera_system
+from kornia_tidy.sensor.noise import SensorNoise
+from tests.benchmarks.any_camera.cameras import camera
+from tests.benchmarks.any_camera.scores import READ_ELECTRONS, scored_scenes
+from tests.benchmarks.any_camera.training import demosaiced, shifted
+
+CAMERA, ELECTRONS = "edof-designed", 57_000.0
+SHIFT = 0.04  # radii of the pupil, 2 % of its diameter
+
+
+def with_hot_pixels(light: Tensor, share: float = 1e-3) -> Tensor:
+    """Return a capture in which a share of the values is at full scale or zero, half each."""
+    drawn = torch.rand(light.shape, generator=torch.Generator().manual_seed(1))
+    return torch.where(drawn < share / 2, 1.0, torch.where(drawn < share, 0.0, light))
+
+
+def compressed(light: Tensor, quality: int) -> Tensor:
+    """Return a capture as JPEG keeps it."""
+    pixels = (linear_rgb_to_rgb(light)[0].permute(1, 2, 0).flip(-1).numpy() * 255).round().astype(np.uint8)
+    data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    read = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    return rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)
+
+
+@torch.no_grad()
+def measure(folder: Path) -> None:
+    """Measure the loss of each disturbance, in decibels beside the undisturbed capture, and write it."""
+    optics = camera(CAMERA)
+    sensor = SensorNoise(READ_ELECTRONS / ELECTRONS, full_well=ELECTRONS)
+    heads = {"any-camera": any_camera_system(optics, sensor).head, "own": load_pretrained(CAMERA).head}
+    moved = TiDyOptics(
+        PixelwiseMask(initial=shifted(optics.masks.heights(), SHIFT, 0.0)),
+        optics.camera,
+        fidelity=optics.fidelity,
+        sensor=None,
+    )
+    rows = []
+    for scene in scored_scenes("test"):
+        depth = metres(optics.camera, scene.inverse_depth)
+        truth = rgb_to_linear_rgb(scene.image)
+        light, off = (one.decode(one(scene.image, depth)).clamp(0, 1) for one in (optics, moved))
+        seen, beside = (sensor(part, generator=torch.Generator().manual_seed(0)) for part in (light, off))
+        hot, jpeg = with_hot_pixels(seen), compressed(seen, 92)
+        over = sensor(4 * light, generator=torch.Generator().manual_seed(0))
+        wide = SensorNoise(sensor.sigma, full_well=ELECTRONS, clip=False)
+        unclipped = wide(4 * light, generator=torch.Generator().manual_seed(0))
+        known = (over < CLIPPED).all(1, keepdim=True)
+        row: dict[str, object] = {"scene": scene.name}
+        for name, head in heads.items():
+
+            def score(capture: Tensor, noise: Tensor | float, mask: Tensor | None = None, gain: float = 1.0) -> float:
+                image = head(linear_rgb_to_rgb(capture.clamp(min=0)), noise=noise).clamp(0, 1)  # noqa: B023
+                error = (image - linear_rgb_to_rgb((gain * truth).clamp(0, 1))).square()  # noqa: B023
+                where = torch.ones_like(error) if mask is None else mask.expand_as(error).float()
+                return float(-10 * ((error * where).sum() / where.sum()).log10())
+
+            row[name] = {
+                "undisturbed": score(seen, sensor.std(seen)),
+                "undisturbed, checked": score(check_capture(seen[0]).light[None], sensor.std(seen)),
+                "hot": score(hot, sensor.std(hot)),
+                "hot, checked": score(check_capture(hot[0]).light[None], sensor.std(seen)),
+                "shifted": score(beside, sensor.std(beside)),
+                "JPEG 92": score(jpeg, sensor.std(jpeg)),
+                "JPEG 92, told 0.006": score(jpeg, 0.006),
+                "demosaiced": score(demosaiced(seen), sensor.std(seen)),
+                "four times overexposed": score(over, sensor.std(over), known, 4.0),
+                "four times overexposed, unclipped": score(unclipped.clamp(max=8), wide.std(unclipped), known, 4.0),
+            }
+        rows.append(row)
+        print(scene.name, flush=True)
+    write_bytes(folder / "guards.json", json.dumps(rows, indent=1).encode())
+    for name in heads:
+        for key in rows[0][name]:  # ty: ignore[not-iterable]
+            each = torch.tensor([row[name][key] for row in rows])  # ty: ignore[not-subscriptable]
+            first = torch.tensor([row[name]["undisturbed"] for row in rows])  # ty: ignore[not-subscriptable]
+            print(f"{name}, {key}: {float(each.mean()):.2f} dB, {float((each - first).mean()):+.2f}")
