@@ -117,6 +117,20 @@ class RuledClosedForm(ClosedForm):
         maps = [capture.clamp(max=1), restored.maps[:, 3:], self._camera_maps(capture, noise[:, :1, :1, :1])]
         return restored._replace(maps=torch.cat(maps, 1))
 
+    def expected_error(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
+        """Return the root mean square error of photographs that is expected behind this camera, in linear light.
+
+        Args:
+            capture: (B, 3, H, W).
+            noise: as for :meth:`forward`.
+
+        Returns:
+            (B, 1, 1, 1), of scenes with as much detail as photographs have, by the kernel that the capture gets.
+        """
+        even = self.noise_map(capture, noise)[:, :1, :1, :1].clamp(min=LEAST_NOISE)
+        place, _, left = self._best(even, self._light(capture))
+        return (left + _at(self.scene_errors.log()[:, None], place).exp()[:, :, None, None]).sqrt()
+
     def _place(self, level: Tensor, light: Tensor) -> Tensor:
         return self._best(10 ** level[:, :1, :1, :1], light)[0]
 
@@ -136,7 +150,7 @@ class RuledClosedForm(ClosedForm):
         left = variance[:, None] * (curve @ logs[1]).exp().to(light)
         best = (scene + left).argmin(1, keepdim=True)
         parts = (best / STEPS, scene.gather(1, best), left.gather(1, best))
-        return tuple(part.to(light)[:, :, None, None] for part in parts)  # ty: ignore[invalid-return-type]
+        return tuple(part.to(light)[:, :, None, None] for part in parts)  # ty: ignore[invalid-explicit-return]
 
     def _left(self, noise: Tensor, place: Tensor) -> Tensor:
         """Return the standard deviation of the noise that a kernel leaves of even noise, all (B, 1, 1, 1)."""

@@ -61,7 +61,8 @@ class Capturing:
 
     def __init__(self, name: str) -> None:
         self.optics = camera(name)
-        self.form = RuledClosedForm(7)
+        self.head = AnyCameraHead(width=1)  # for its share
+        self.form = self.head.closed_form
         self.form.set_psfs(closed_form_bank(self.optics, self.form.layers))
 
     def captures(self, scenes: list[BenchScene]) -> Iterator[tuple[BenchScene, float, Tensor, Tensor]]:
@@ -99,7 +100,8 @@ def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, t
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
         restored = own.form(capture, noise)
-        images = {key: corrected(restored.image, network(restored.maps)) for key, network in networks.items()}
+        largest = own.head.largest_share(capture, noise)
+        images = {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:
             images["own"] = head(capture, noise=noise)
         scores = {key: float(psnr(image.clamp(0, 1), scene.image)) for key, image in images.items()}
