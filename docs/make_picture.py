@@ -2,8 +2,8 @@
 
     python docs/make_picture.py
 
-Scene, captures and estimates are those of the trained system "joint-5" that comes with the library: five learnt masks
-and the network that reads their capture.
+Scene, captures and estimates are those of the trained system "joint-uncertain" that comes with the library: five
+learnt masks and the network that reads their capture.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     parser.add_argument("--output", type=Path, default=PICTURE, help="picture to write (default: %(default)s)")
     options = parser.parse_args(arguments)
 
-    system = load_pretrained("joint-5")
+    system = load_pretrained("joint-uncertain")
     camera = system.optics.camera
     image, depth = dead_leaves(
         options.size, options.size, depth_range=camera.depth_range, num_leaves=300, seed=options.seed

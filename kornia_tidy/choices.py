@@ -41,14 +41,19 @@ DEMOSAIC = (
 WHITE_BALANCES = ("as shot", "daylight", "auto", "none")
 HIGHLIGHTS = ("clip", "keep")
 ADAPTATIONS = ("Bradford", "CAT02", "CAT16", "Von Kries")
-PRETRAINED = (
-    "joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat", "joint-uncertain",
-)  # fmt: skip
-"""Shipped systems: task and number of masks; 0 masks are a Fresnel element, as in the paper. All have the paper's lens
-of f/17.6 but three. The networks of two know light of 500 to 57,000 electrons of white at f/17.6 in the same exposure
-time: ``"edof-designed"`` has five masks at f/22, of 92 x 92 pixels; ``"edof-flat"`` has none, at f/48.
-``"joint-uncertain"`` has five masks at f/28.5, designed for image and depth, and a network that begins with the closed
-form: it returns a distribution of depth, so that it tells how sure it is, and a better image."""
+PRETRAINED = ("joint-uncertain", "edof-5", "edof-1", "edof-designed", "edof-flat")
+"""Shipped systems: task and number of masks. ``"edof-5"`` and ``"edof-1"`` have the paper's lens of f/17.6. The
+networks of ``"edof-designed"``, five masks of 92 x 92 pixels at f/22, and of ``"edof-flat"``, none at f/48, know light
+of 500 to 57,000 electrons of white at f/17.6 in the same exposure time. ``"joint-uncertain"`` has five masks at f/28.5,
+designed for image and depth, and a network that begins with the closed form: it returns a distribution of depth, so
+that it tells how sure it is."""
+REPLACED = {
+    "joint-5": "joint-uncertain",
+    "joint-1": "joint-uncertain",
+    "joint-0": "joint-uncertain",
+    "edof-0": "edof-flat",
+}
+"""Systems of earlier versions, and what took the place of each."""
 
 Preset = Annotated[str, one_of(PRESETS)]
 Compositing = Annotated[str, one_of(COMPOSITING)]

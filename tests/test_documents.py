@@ -241,7 +241,7 @@ class TestEveryPage(BaseTester):
     def test_feature_the_picture_of_the_readme_is_drawn(self, tmp_path):
         script = ROOT / "docs" / "make_picture.py"
         namespace = runpy.run_path(str(script))
-        path = namespace["main"](["--size", "64", "--output", str(tmp_path / "new" / "camera.png")])
+        path = namespace["main"](["--size", "72", "--output", str(tmp_path / "new" / "camera.png")])
         assert read_image(path).shape == read_image(namespace["PICTURE"]).shape
         assert namespace["PICTURE"].stat().st_size < 300_000
 

@@ -104,21 +104,13 @@ class TestNoise(BaseTester):
 class TestSystems(BaseTester):
     def test_feature_kinds_are_told_from_the_masks(self):
         makers = available()
-        kinds = {
-            name: makers[name]().kind for name in ("edof-5", "edof-0", FLAT, "preset chang2019", "joint-1 as trained")
-        }
-        assert list(kinds.values()) == ["coded", "Fresnel", "flat", "published", "as trained"]
+        kinds = {name: makers[name]().kind for name in ("edof-5", FLAT, "preset chang2019")}
+        assert list(kinds.values()) == ["coded", "flat", "published"]
 
     def test_feature_psfs_of_129_pixels_and_stray_light_hold_all_light(self):
         bank = available()["edof-1"]().optics.psf_bank(defocus=[-20.0, 0.0])
         assert bank.window == WINDOW == 129
         self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
-
-    def test_feature_a_system_as_trained_has_its_window_and_no_stray_light(self):
-        system = available()["joint-1 as trained"]()
-        assert system.optics.window == load_pretrained("joint-1").optics.window < WINDOW
-        assert f"PSFs of {system.optics.window} px" in system.title
-        assert system.optics.psf_bank(defocus=[0.0]).veil is None
 
     def test_feature_captures_with_occlusion_differ_where_depth_steps_and_there_alone(self):
         plain, occluded = (available()[f"edof-flat{words}"]() for words in ("", " with occlusion"))
@@ -149,7 +141,7 @@ class TestSystems(BaseTester):
         from kornia_tidy.reconstruction.pretrained import FOLDER
 
         (tmp_path / "mine").mkdir()
-        shutil.copy(FOLDER / "edof-0.safetensors", tmp_path / "mine" / "best.safetensors")
+        shutil.copy(FOLDER / "edof-1.safetensors", tmp_path / "mine" / "best.safetensors")
         assert from_checkpoint(tmp_path / "mine" / "best.safetensors").name == "mine"
 
     def test_feature_a_folder_with_its_own_aperture_and_without_masks(self, tmp_path):
@@ -211,8 +203,7 @@ class TestRestorations(BaseTester):
         self.assert_close(averaged, expected)
         assert (averaged - alone).abs().max() > 1e-3
 
-    def test_feature_networks_without_noise_have_no_wrong_levels(self):
-        assert [name for name in restorations_for(available()["joint-1"]()) if NETWORK in name] == [NETWORK]
+    def test_feature_a_lens_without_a_network_has_no_wrong_levels(self):
         assert not any(NETWORK in name for name in restorations_for(available()[FLAT]()))
 
     def test_feature_tikhonov_undoes_a_flat_lens(self):
@@ -507,7 +498,7 @@ class TestCommand(BaseTester):
     @pytest.mark.parametrize(
         ("arguments", "match"),
         [
-            (["--systems", "flat f/1"], "there is no system 'flat f/1': choose among joint-5"),
+            (["--systems", "flat f/1"], "there is no system 'flat f/1': choose among joint-uncertain"),
             (["--quick", "--report"], "holds no complete results yet"),
         ],
     )
@@ -549,8 +540,8 @@ class TestDepthUncertainty(BaseTester):
         assert cells[6].endswith(" %")
 
     def test_exception_a_network_that_does_not_tell_is_named(self):
-        with pytest.raises(ValueError, match="joint-5 does not tell how sure"):
-            depth_uncertainty.row(available()["joint-5"](), FIXED[0])
+        with pytest.raises(ValueError, match="edof-1 does not tell how sure"):
+            depth_uncertainty.row(available()["edof-1"](), FIXED[0])
 
     def test_feature_variances_of_a_fitted_temperature_are_as_large_as_squared_errors(self):
         generator = torch.Generator().manual_seed(0)

@@ -1,8 +1,9 @@
-"""The systems that come with the package, scored under other conditions without further training."""
+"""Systems that come with the package or came with it, scored under other conditions without further training."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from examples.paper.cameras import F_NUMBER
@@ -10,12 +11,19 @@ from examples.paper.closed_forms import ClosedForms
 from examples.paper.scenes import Budget, painted, real
 from examples.paper.training import best_temperature, mean_scores, prefixed, system_of
 from kornia_tidy import TiDyOptics
-from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 from kornia_tidy.sensor.exposure import exposed_sensor
 
+EARLIER = Path(__file__).parent / "systems"
 ELECTRONS = 57_000.0  # at f/17.6: a noise of 0.002 at a fifth of full scale, in which the systems were trained
 SIZES = {"smoke": (64, 2, 0), "cpu": (128, 6, 4), "gpu": (256, 64, 35), "paper": (256, 419, 35)}
 """Side of the scenes in pixels, and the numbers of painted and of real ones, by scale."""
+
+
+def load_shipped(name: str) -> TrainedSystem:
+    """Return a system that comes with the package, or one that came with it when the experiments were run."""
+    return load_pretrained(name) if name in PRETRAINED else load_trained(EARLIER / f"{name}.safetensors")
 
 
 def shipped_scores(name: str, scale: str, **changed: Any) -> Mapping[str, float | str]:
@@ -24,11 +32,11 @@ def shipped_scores(name: str, scale: str, **changed: Any) -> Mapping[str, float 
     The network is as it was trained. The closed form is given the PSFs of the changed camera.
 
     Args:
-        name: of the system, see :func:`~kornia_tidy.reconstruction.pretrained.load_pretrained`.
+        name: of the system, see :func:`load_shipped`.
         scale: of the experiment.
         **changed: arguments of :class:`~kornia_tidy.TiDyOptics` that differ from the shipped camera's.
     """
-    shipped = load_pretrained(name)
+    shipped = load_shipped(name)
     optics, task = with_parts(shipped.optics, **changed), shipped.settings.task
     network = system_of(optics, shipped.head, shipped.settings, shipped.step)
     closed = system_of(optics, ClosedForms(optics, task), shipped.settings, 0)

@@ -15,10 +15,9 @@ from examples.paper.closed_forms import ClosedForms
 from examples.paper.report import cell, grid
 from examples.paper.runner import Row, Trial
 from examples.paper.scenes import Budget, painted, real
-from examples.paper.shipped import ELECTRONS, with_parts
+from examples.paper.shipped import ELECTRONS, load_shipped, with_parts
 from examples.paper.training import best_temperature, fit, mean_scores, prefixed, system_of
 from kornia_tidy import TiDyOptics
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.trained import TrainedSystem
 
 AS_SHIPPED = "as shipped"
@@ -72,7 +71,7 @@ def crossed_scores(
     Returns:
         Scores by what restored the captures, condition, scenes and score, such as ``network_4 ms_painted_psnr``.
     """
-    budget, shipped = BUDGETS[scale], load_pretrained(trial["system"])
+    budget, shipped = BUDGETS[scale], load_shipped(trial["system"])
     system = shipped
     if trial["trained"] != AS_SHIPPED:
         optics = with_parts(shipped.optics, **conditions[trial["trained"]])

@@ -19,8 +19,8 @@ from examples.paper.closed_forms import ClosedForms
 from examples.paper.report import cell, grid, means
 from examples.paper.runner import Experiment, Row, Trial, main
 from examples.paper.scenes import Budget, painted, real
+from examples.paper.shipped import load_shipped
 from examples.paper.training import best_temperature, mean_scores, prefixed, system_of
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.sensor.exposure import exposed_sensor
 
 TRAINED = ("joint-5", "joint-1", "joint-0", "edof-5", "edof-1", "edof-0", "edof-designed", "edof-flat")
@@ -40,7 +40,7 @@ def trials(scale: str) -> list[Trial]:
 
 def measure(trial: Trial, scale: str) -> Mapping[str, float | str]:
     """Return the scores of a shipped system's network and of the closed form, on each set of scenes."""
-    shipped = load_pretrained(trial["system"])
+    shipped = load_shipped(trial["system"])
     optics, task = shipped.optics, shipped.settings.task
     optics.sensor = exposed_sensor(optics.camera.f_number, ELECTRONS, F_NUMBER)
     network = system_of(optics, shipped.head, shipped.settings, shipped.step)

@@ -16,6 +16,7 @@ from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part, described, unmasked
+from kornia_tidy.choices import REPLACED
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.optics.lens.lens import Lens
@@ -103,7 +104,7 @@ def simulate(
 
 def reconstruct(
     capture: NDArray[Any],
-    system: TiDyOptics | TrainedSystem | LightHead | str | os.PathLike[str] = "joint-5",
+    system: TiDyOptics | TrainedSystem | LightHead | str | os.PathLike[str] = "joint-uncertain",
     *,
     color: Color = "bgr",
     linear: bool = False,
@@ -244,7 +245,7 @@ def _light_head(system: Any) -> LightHead:
     """Return the network of a system for linear light."""
     if isinstance(system, LightHead):
         return system
-    if isinstance(system, str) and system in PRETRAINED:
+    if isinstance(system, str) and system in (*PRETRAINED, *REPLACED):
         return _shipped(system)
     if isinstance(system, (str, os.PathLike)):
         file = os.path.isfile(system)

@@ -72,7 +72,7 @@ def model_card(system: TrainedSystem, title: str, license: str | None = None) ->
 
     Example:
         >>> from kornia_tidy.reconstruction.pretrained import load_pretrained
-        >>> model_card(load_pretrained("joint-5"), "joint-5", "apache-2.0").splitlines()[1:4]
+        >>> model_card(load_pretrained("joint-uncertain"), "joint-uncertain", "apache-2.0").splitlines()[1:4]
         ['library_name: kornia_tidy', 'license: apache-2.0', 'pipeline_tag: depth-estimation']
     """
     check_license(license)

@@ -51,7 +51,7 @@ LAYERS, WINDOW = 21, 23
 SIZES = {"1 megapixel": (864, 1152), "12 megapixels": (3000, 4000)}
 QUICK_SIZES = {"1 megapixel": (48, 64), "12 megapixels": (64, 96)}
 NETWORKS = ("midas-small", "attention-unet-16", "attention-unet-64")
-SYSTEMS = ("edof-5", "joint-5")
+SYSTEMS = ("edof-5", "joint-uncertain")
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from kornia_tidy.data.patches import central_crop
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
-from kornia_tidy.reconstruction.pretrained import FOLDER, ship
+from kornia_tidy.reconstruction.pretrained import ship
 from kornia_tidy.reconstruction.tasks import stretched
 from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.callbacks import BEST
@@ -43,6 +43,7 @@ from kornia_tidy.training.run import train
 from kornia_tidy.training.settings import TrainingSettings
 from tests.scenes import ENTRIES, load_scene
 
+FOLDER = Path(__file__).parents[2] / "examples/paper/systems"  # of the systems that earlier versions shipped
 SETTINGS = TrainingSettings(
     # Shot noise at a fifth of full scale, of 57,000 electrons: pixels of 8 um with the well of an industrial sensor's
     # 10,500 electrons in 3.45 um.

@@ -1,7 +1,8 @@
 """Trains a small joint network that tells how uncertain its depth is, and scores it on real scenes.
 
-The camera is that of the shipped system ``joint-5``, whose masks stay as they are. Scenes are dead leaves, photographed
-once without noise; crops and noise are drawn for each step. None of the scenes of the tables is trained on.
+The camera is that of ``joint-5``, which earlier versions shipped, whose masks stay as they are. Scenes are dead leaves,
+photographed once without noise; crops and noise are drawn for each step. None of the scenes of the tables is trained
+on.
 
 - ``python -m tests.benchmarks.joint_depth train FILE``: the network, as a checkpoint of the library; ``--steps``.
 - ``... score FILE``: half of the real scenes, those of ``scenes.json`` that a fixed seed chooses for choosing settings;
@@ -23,6 +24,7 @@ from kornia.filters import box_blur
 from torch import Tensor
 from tqdm import tqdm
 
+from examples.paper.shipped import load_shipped
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.figures.reliability import Reliability, draw_reliability
@@ -37,7 +39,6 @@ from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
 from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.reliability import reliability_curve, sparsification_curve
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import write_state
@@ -57,7 +58,7 @@ SEED = 20261122
 
 def system() -> tuple[TiDyOptics, SystemSettings]:
     """Return the camera, and the settings of the system to train."""
-    shipped = load_pretrained("joint-5")
+    shipped = load_shipped("joint-5")
     settings = shipped.settings.replace(residual=False, refocus=11, depth_classes=32)
     return shipped.optics, settings
 

@@ -18,8 +18,8 @@ from examples.paper.scenes import BUDGETS, ForCamera, painted
 from examples.paper.sequence_length import EXPERIMENT, first_masks
 from examples.paper.training import closed_form_system, constant_depth, mean_scores, train
 from kornia_tidy import FresnelLens, PixelwiseMask, ThinLensCamera
+from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.optics.published_systems import SYSTEMS
-from kornia_tidy.reconstruction.pretrained import PRETRAINED
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from tests.base import BaseTester
 
@@ -203,7 +203,9 @@ class TestSystems(BaseTester):
         self.assert_close(other, own.flip((-2, -1)), atol=1e-6, rtol=1e-3)
 
     def test_smoke_its_systems_are_shipped(self):
-        assert {trial["system"] for trial in transfer.trials("cpu")} == set(transfer.TRAINED) <= set(PRETRAINED)
+        assert (
+            {trial["system"] for trial in transfer.trials("cpu")} == set(transfer.TRAINED) <= {*PRETRAINED, *REPLACED}
+        )
 
 
 def test_feature_a_mean_has_its_standard_error():

@@ -11,9 +11,9 @@ from examples.paper import boundaries_training, switching_training, trained_furt
 from examples.paper.cameras import camera_with
 from examples.paper.scenes import BUDGETS
 from examples.paper.sequence_length import first_masks
+from examples.paper.shipped import load_shipped
 from examples.paper.training import fit, head_settings, mean_scores
 from kornia_tidy import DwellTimes, Switching
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.trained import build_head
 from tests.base import BaseTester
 
@@ -56,7 +56,7 @@ class TestCrossedScores(BaseTester):
         monkeypatch.setitem(trained_further.BUDGETS, "smoke", TINY)
         trial = {"system": "joint-1", "trained": trained_further.AS_SHIPPED, "seed": "0"}
         shipped = trained_further.crossed_scores(trial, "smoke", GATHER, ["gather"])
-        system = load_pretrained("joint-1")
+        system = load_shipped("joint-1")
         optics = trained_further.with_parts(system.optics)
         scene = trained_further.painted(TINY, "test", TINY.scored)
         direct = mean_scores(trained_further.system_of(optics, system.head, system.settings, system.step), scene)

@@ -5,11 +5,24 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 
+from kornia_tidy import reconstruct
+from kornia_tidy.choices import REPLACED
+from kornia_tidy.cli.app.settings import Settings
+from kornia_tidy.cli.commands.system_options import head_file
 from kornia_tidy.data.dead_leaves import DeadLeaves
-from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, about_pretrained, load_pretrained, ship
+from kornia_tidy.reconstruction.pretrained import (
+    FOLDER,
+    PRETRAINED,
+    about_pretrained,
+    load_pretrained,
+    pretrained_record,
+    pretrained_settings,
+    ship,
+)
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.trained import load_trained, load_weights
 from kornia_tidy.training.evaluation import evaluate, mean_row
@@ -115,3 +128,14 @@ class TestPretrained(BaseTester):
     def test_exception_unknown_name(self):
         with pytest.raises(ValueError, match="name must be one of"):
             load_pretrained("edof-7")
+
+    @pytest.mark.parametrize("name", REPLACED)
+    def test_exception_a_system_of_an_earlier_version_names_what_took_its_place(self, name):
+        sentence = f"the system {name!r} is no longer shipped: {REPLACED[name]!r} took its place"
+        for refuse in (load_pretrained, pretrained_settings, pretrained_record, head_file):
+            with pytest.raises(ValueError, match=sentence):
+                refuse(name)
+        with pytest.raises(ValueError, match=sentence):
+            reconstruct(np.zeros((4, 4, 3), np.uint8), name)
+        with pytest.raises(ValueError, match=sentence):
+            Settings(camera=name)

@@ -105,8 +105,8 @@ def camera_name(name: str) -> str:
     """Return a system as a user sees it in the list of cameras.
 
     Example:
-        >>> camera_name("joint-5"), camera_name("edof-0"), camera_name("ikoma2021")
-        ('trained joint-5: image, depth, K = 5', 'trained edof-0: image, plain lens', 'published: Ikoma et al.')
+        >>> camera_name("edof-5"), camera_name("joint-uncertain"), camera_name("ikoma2021")
+        ('trained edof-5: image, K = 5', 'trained joint-uncertain', 'published: Ikoma et al.')
     """
     if name == OWN:
         return "your own lens and masks"
@@ -115,7 +115,7 @@ def camera_name(name: str) -> str:
     task, _, masks = name.partition("-")
     if task not in TASKS or not masks.isdigit():
         return f"trained {name}"
-    return f"trained {name}: {TASKS[task]}, " + ("plain lens" if masks == "0" else f"K = {masks}")
+    return f"trained {name}: {TASKS[task]}, K = {masks}"
 
 
 CONTROLS = (
@@ -235,7 +235,7 @@ def shown(group: Group, scene: str, camera: str, stretch: bool) -> bool:
     """Return whether a group of controls has an effect, and so is shown.
 
     Example:
-        >>> shown("files", "dead leaves", "joint-5", stretch=True), shown("own camera", "dead leaves", "own", True)
+        >>> shown("files", "dead leaves", "edof-5", stretch=True), shown("own camera", "dead leaves", "own", True)
         (False, True)
     """
     if group == "files":

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.choices import LENSES, STARTS
+from kornia_tidy.choices import LENSES, REPLACED, STARTS
 from kornia_tidy.data.dead_leaves import MOST_LEAVES, PIXELS_A_LEAF
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.pretrained import PRETRAINED
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, check_shipped
 from kornia_tidy.reconstruction.settings import MaskSettings
 from kornia_tidy.render.compositing import COMPOSITING
 
@@ -81,7 +81,7 @@ class Settings:
     stretch: bool = True
     near: float = 0.3
     far: float = 10.0
-    camera: str = "joint-5"
+    camera: str = "joint-uncertain"
     f_number: float = round(LENS.f_number, 1)
     focus_distance: float = float(LENS.focus_distance)
     focal_length: float = LENS.focal_length
@@ -109,6 +109,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_choice("the scene", self.scene, SCENES)
+        if self.camera in REPLACED:
+            check_shipped(self.camera)
         check_choice("the camera", self.camera, CAMERAS)
         check_choice("compositing", self.compositing, (AS_SYSTEM, *COMPOSITING))
         check_choice("the lens", self.lens, (IDEAL, *LENSES))

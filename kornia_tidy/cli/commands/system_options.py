@@ -6,10 +6,10 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kornia_tidy.choices import PRETRAINED
+from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.files import read_bytes
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
-from kornia_tidy.reconstruction.pretrained import FOLDER
+from kornia_tidy.reconstruction.pretrained import FOLDER, check_shipped
 
 if TYPE_CHECKING:
     from kornia_tidy.reconstruction.trained import TrainedSystem
@@ -27,6 +27,8 @@ def head_file(head: str) -> Path:
         return FOLDER / f"{head}.safetensors"
     if head in CLOSED_FORMS:
         raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs")
+    if head in REPLACED:
+        check_shipped(head)
     if not Path(head).exists():
         raise FileNotFoundError(
             f"a system is {', '.join(PRETRAINED)}, a checkpoint, or a saved camera: there is no file {head}"

@@ -11,13 +11,26 @@ from pathlib import Path
 from typing import Any
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.choices import PRETRAINED
+from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
+
+
+def check_shipped(name: str) -> None:
+    """Raise ``ValueError`` unless a system is shipped; for one of an earlier version, name what took its place.
+
+    Example:
+        >>> check_shipped("joint-5")
+        Traceback (most recent call last):
+        ValueError: the system 'joint-5' is no longer shipped: 'joint-uncertain' took its place
+    """
+    if name in REPLACED:
+        raise ValueError(f"the system {name!r} is no longer shipped: {REPLACED[name]!r} took its place")
+    check_choice("name", name, PRETRAINED)
 
 
 def load_pretrained(name: str) -> TrainedSystem:
@@ -43,7 +56,7 @@ def load_pretrained(name: str) -> TrainedSystem:
         >>> estimate.shape
         torch.Size([1, 3, 72, 72])
     """
-    check_choice("name", name, PRETRAINED)
+    check_shipped(name)
     return load_trained(FOLDER / f"{name}.safetensors")
 
 
@@ -51,10 +64,10 @@ def pretrained_settings(name: str) -> SystemSettings:
     """Return the settings of camera and network of a shipped system, without building them.
 
     Example:
-        >>> pretrained_settings("joint-1").masks
+        >>> pretrained_settings("edof-1").masks
         1
     """
-    check_choice("name", name, PRETRAINED)
+    check_shipped(name)
     known, _ = SystemSettings.split(read_state(FOLDER / f"{name}.safetensors")["settings"])
     return SystemSettings(**known)
 
@@ -71,7 +84,7 @@ def pretrained_record(name: str) -> dict[str, Any]:
         >>> sorted(pretrained_record("edof-5")["scores"])
         ['dead leaves', 'real scenes']
     """
-    check_choice("name", name, PRETRAINED)
+    check_shipped(name)
     about = about_pretrained()
     return {**{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}, **about["systems"][name]}
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLORS = {FIVE: ACCENT, ONE: BLUE, "edof-0": FAINT}
+COLORS = {FIVE: ACCENT, ONE: BLUE}
 LIGHTS = dict(zip(PHYSICAL, (INK, ACCENT, BLUE, GREEN), strict=True))
 LABEL, SMALL, TITLE = 8, 7, 9  # pt
 

@@ -47,10 +47,8 @@ this page, and goes on where it was interrupted.
   with the camera; *in 8 orientations* is the mean of its results for the turned and mirrored capture.
 - **Scores** are those of sRGB images clipped to [0, 1]. Chroma PSNR is that of Cb and Cr. ± is the standard error of
   the mean of differences, taken scene by scene.
-- **Systems.** `edof-5` has five masks, `edof-1` one, and `edof-0` a Fresnel element of 10 rad, the paper's camera of
-  no masks. `joint` systems also estimate depth. *As trained* is the camera with the small window of its training,
-  PSFs scaled to sum one, and no stray light. *Flat* is a lens without masks at its f-number. *Preset* is a
-  published camera with its masks as before training.
+- **Systems.** `edof-5` has five masks, `edof-1` one. `joint` systems also estimate depth. *Flat* is a lens without
+  masks at its f-number. *Preset* is a published camera with its masks as before training.
 """
 
 

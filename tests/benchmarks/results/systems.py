@@ -17,7 +17,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.hub import from_pretrained
-from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_settings
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 
 WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded apertures by 0.4 to 0.7 dB
@@ -55,7 +55,6 @@ class System:
             "flat": "flat lens",
             "Fresnel": "Fresnel element of 10 rad, as in the paper",
             "published": f"{count} mask{'s' * (count > 1)} as before training",
-            "as trained": f"K = {count}, PSFs of {self.optics.window} px of sum one",
             "with occlusion": f"{'flat lens' if self.optics.masks.is_flat() else f'K = {count}'}, with occlusion",
             "coded": f"K = {count}",
         }
@@ -65,8 +64,6 @@ class System:
 def available() -> dict[str, Callable[[], System]]:
     """Return a function for each system that the benchmark knows by name."""
     known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
-    small = [name for name in PRETRAINED if pretrained_settings(name).stray_light is None and not name.endswith("-0")]
-    known |= {f"{name} as trained": _as_trained(name) for name in small}
     known |= {f"{name} with occlusion": _with_occlusion(name) for name in OCCLUDED}
     known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
     return known | {f"preset {name}": _published(name) for name in SYSTEMS}
@@ -92,19 +89,6 @@ def of_trained(name: str, trained: TrainedSystem) -> System:
 
 def _shipped(name: str) -> Callable[[], System]:
     return lambda: of_trained(name, load_pretrained(name))
-
-
-def _as_trained(name: str) -> Callable[[], System]:
-    """A shipped system in the small window that it was trained with: captures without stray light."""
-
-    def make() -> System:
-        trained = load_pretrained(name)
-        fidelity = trained.optics.fidelity
-        return _system(
-            f"{name} as trained", "as trained", trained.optics, trained.head, trained.settings.task, fidelity
-        )
-
-    return make
 
 
 def _with_occlusion(name: str) -> Callable[[], System]:

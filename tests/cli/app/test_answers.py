@@ -36,7 +36,7 @@ class TestAnswer(BaseTester):
             assert picture.dtype == np.uint8
             assert picture.shape[2] == 3
             assert picture.std() > 10
-        assert found.message.startswith("50 mm f/17.6, focus at 0.595 m")
+        assert found.message.startswith("50 mm f/28.5, focus at 0.595 m")
         assert found.script.startswith('"""A coded capture')
 
     def test_feature_no_picture_of_a_depth_that_is_not_estimated(self):
@@ -45,26 +45,26 @@ class TestAnswer(BaseTester):
         assert found.legends["estimate"].startswith("**No depth estimate**")
 
     def uploaded(self, folder, depth, **values):
-        write_image(folder / "photo.png", torch.rand(3, 48, 64))
+        write_image(folder / "photo.png", torch.rand(3, 72, 96))
         if depth is not None:
             write_depth(folder / "depth.npy", depth)
         files = {"image_file": str(folder / "photo.png"), "depth_file": str(folder / "depth.npy")}
         return answer({"scene": "files", **files, **SMALL, **values})
 
     def test_feature_uploaded_files(self, tmp_path):
-        found = self.uploaded(tmp_path, torch.linspace(0.5, 2, 64).expand(1, 48, 64).contiguous())
-        assert found.pictures["scene"].shape == (48, 64, 3)
+        found = self.uploaded(tmp_path, torch.linspace(0.5, 2, 96).expand(1, 72, 96).contiguous())
+        assert found.pictures["scene"].shape == (72, 96, 3)
         assert 'read_files("photo.png", "depth.npy", depth_scale=1.0, side=96)' in found.script
 
     @pytest.mark.parametrize(
         ("depth", "values", "sentence"),
         [
-            (torch.ones(1, 24, 32), {}, "Photo and depth map must have the same size, got 64 x 48 and 32 x 24 pixels"),
-            (torch.full((1, 48, 64), 1500.0), {}, "The middle depth of depth.npy would be 1.5e+03 m"),
+            (torch.ones(1, 24, 32), {}, "Photo and depth map must have the same size, got 96 x 72 and 32 x 24 pixels"),
+            (torch.full((1, 72, 96), 1500.0), {}, "The middle depth of depth.npy would be 1.5e+03 m"),
             (None, {}, "There is no file depth.npy: upload it again"),
-            (torch.ones(1, 48, 64), {"depth_file": None}, "The depth map of the photo is missing: upload both"),
-            (torch.ones(1, 48, 64), {}, "The whole scene lies at 1 m, and one depth cannot be stretched or fitted"),
-            (torch.ones(1, 48, 64), {"noise": None}, "Read noise (% of full scale): give a number"),
+            (torch.ones(1, 72, 96), {"depth_file": None}, "The depth map of the photo is missing: upload both"),
+            (torch.ones(1, 72, 96), {}, "The whole scene lies at 1 m, and one depth cannot be stretched or fitted"),
+            (torch.ones(1, 72, 96), {"noise": None}, "Read noise (% of full scale): give a number"),
         ],
     )  # fmt: skip
     def test_exception_is_one_sentence_without_folders(self, tmp_path, capsys, depth, values, sentence):
@@ -96,7 +96,7 @@ class TestLegends(BaseTester):
         assert "96 x 72 pixels" in words["scene"]
         assert f"PSNR {scores['capture_psnr']:.1f} dB" in words["capture"]
         assert "5 masks, in turn; gather, noise 0.2 % of full scale" in words["capture"]
-        assert f"by the network of joint-5. PSNR {scores['image_psnr']:.1f} dB" in words["image"]
+        assert f"by the network of joint-uncertain. PSNR {scores['image_psnr']:.1f} dB" in words["image"]
         assert f"RMSE {scores['depth_rmse']:.2f} of the range" in words["estimate"]
         assert f"{trained.optics.window} x {trained.optics.window} pixels" in words["psfs"]
 
@@ -109,7 +109,7 @@ class TestLegends(BaseTester):
     @pytest.mark.parametrize(
         ("camera", "words"),
         [
-            ("joint-1", "exposure through 1 mask; gather"),
+            ("edof-1", "exposure through 1 mask; gather"),
             ("edof-flat", "through a lens without programmed masks; gather"),
         ],
     )

@@ -25,7 +25,7 @@ FILES = {"scene": "files", "image_file": "photo.png", "depth_file": "depth.png",
 EVERY_KIND = {
     "trained": {},
     "trained for the image": {"camera": "edof-1", "compositing": "scatter", "noise": 0.01},
-    "a plain lens": {"camera": "joint-0", "stretch": False, "near": 0.4, "far": 5.0},
+    "a plain lens": {"camera": "edof-flat", "stretch": False, "near": 0.4, "far": 5.0},
     "published": {"camera": "phasecam3d", "scene": "photographic leaves", "seed": 3},
     "published, other compositing": {"camera": "tidy-5", "compositing": "scatter", "mask_seed": 7},
     "own": {"camera": "own", "start": "noise", "masks": 7, "scene": "test chart", "noise": 0.0},
@@ -72,7 +72,7 @@ class TestTakePicture(BaseTester):
             expected = optics(image, depth, generator=torch.Generator().manual_seed(0))
         assert torch.equal(take_picture(settings).capture, expected)
 
-    @pytest.mark.parametrize("camera", ["joint-5", "ikoma2021"])
+    @pytest.mark.parametrize("camera", ["joint-uncertain", "ikoma2021"])
     def test_feature_stretched_depths_fill_the_range_of_the_camera(self, camera):
         result = take_picture(Settings(camera=camera, **SMALL))
         assert result.clamped == 0
@@ -216,7 +216,7 @@ class TestBehindALens(BaseTester):
 
 class TestResult(BaseTester):
     def test_feature_psnr_is_that_of_the_metric(self):
-        result = take_picture(Settings(camera="edof-0", **SMALL))
+        result = take_picture(Settings(camera="edof-flat", **SMALL))
         assert result.scores()["capture_psnr"] == pytest.approx(
             float(psnr(result.capture[None], result.scene.image[None]))
         )

@@ -112,14 +112,14 @@ class TestControls(BaseTester):
     @pytest.mark.parametrize(
         ("group", "scene", "camera", "stretch", "expected"),
         [
-            ("own camera", "dead leaves", "joint-5", True, False),
+            ("own camera", "dead leaves", "edof-5", True, False),
             ("own camera", "files", "own", True, True),
-            ("painted depths", "dead leaves", "joint-5", True, False),
-            ("painted depths", "dead leaves", "joint-5", False, True),
+            ("painted depths", "dead leaves", "edof-5", True, False),
+            ("painted depths", "dead leaves", "edof-5", False, True),
             ("painted depths", "test chart", "own", True, True),
             ("painted depths", "files", "own", True, False),
             ("painted scene", "test chart", "own", True, False),
-            ("files", "files", "joint-5", True, True),
+            ("files", "files", "edof-5", True, True),
             ("camera", "files", "own", False, True),
         ],
     )

@@ -106,7 +106,7 @@ class TestRawReconstruct(BaseTester):
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
-            (["shot.dng"], "a system is needed: one of joint-5,"),
+            (["shot.dng"], "a system is needed: one of joint-uncertain,"),
             (["shot.dng", "--head", "wiener"], "the head 'wiener' needs the PSFs of a camera: give --psfs"),
             (["shot.dng", "--psfs", "bank.safetensors"], "the noise of shot.dng is not known: give --noise"),
             (["iso100.dng", *MEASURED], "the noise was measured at ISO 800, and iso100.dng was taken at ISO 100"),

@@ -232,10 +232,10 @@ class TestRawReconstruct(BaseTester):
     @pytest.mark.takes_seconds
     def test_feature_a_network_that_comes_with_the_library_needs_no_checkpoint(self, tmp_path, capsys):
         (tmp_path / "a.dng").write_bytes(raw_file())
-        assert reconstruct([str(tmp_path / "a.dng")], "edof-0", tmp_path) == 0
-        assert json.loads((tmp_path / "a.json").read_text())["head"] == "edof-0"
+        assert reconstruct([str(tmp_path / "a.dng")], "edof-flat", tmp_path) == 0
+        assert json.loads((tmp_path / "a.json").read_text())["head"] == "edof-flat"
         light = develop(RawCapture.open(tmp_path / "a.dng"), encoded=False, upright=False)
-        image, *_ = reconstruct_light(LightHead(load_pretrained("edof-0")), light)
+        image, *_ = reconstruct_light(LightHead(load_pretrained("edof-flat")), light)
         assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
 
     def test_feature_dumps_are_developed_linearly(self, tmp_path):
