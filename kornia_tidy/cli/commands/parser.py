@@ -129,7 +129,7 @@ def make_parser(command: type, prog: str, everything: bool = False) -> Parser:
     parser.usage = " ".join(["%(prog)s", *usage, "[options]"])
     groups[""].add_argument("-h", "--help", action="help", help="show this help")
     if notes or basic:
-        groups[""].add_argument("--help-all", action="help", help="show all that there is to say")
+        groups[""].add_argument("--help-all", action="help", help="show all options and notes")
     return parser
 
 

@@ -104,11 +104,11 @@ class Render:
     )
     notes: ClassVar = """\
 After an interruption the same command continues and gives the same bytes, since captures
-and shards are written atomically. A capture is determined by camera, scene, seed and
-number alone, for any --jobs and any process (on processors of one kind). Processes of
-torchrun or srun, or others with RANK and WORLD_SIZE in their environment, share the work,
-on one machine or on several that share FOLDER. One that is done with its share takes over
-what is missing: a process that is lost loses nothing.
+and shards are written atomically. Camera, scene, seed and number determine a capture, for
+any --jobs and any process (on processors of one kind). Processes of torchrun or srun, or
+others with RANK and WORLD_SIZE in their environment, share the work, on one machine or on
+several that share FOLDER. A process that finishes its share renders missing captures of
+others, so that nothing is lost with a process.
 
 In Python, in a data loader:
   from kornia_tidy.training.coded_datasets.captures import CodedCaptures
