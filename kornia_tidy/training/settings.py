@@ -37,7 +37,7 @@ LEARN = {
     "both": "masks and network",
     "network": "the network behind fixed optics",
     "refiner": "the second network behind fixed optics, after the first",
-    "masks": "the masks, through a network that stays as it is",
+    "masks": "the masks, through a fixed network",
 }
 FIXED_OPTICS = ("network", "refiner")
 SSIM_WINDOW = 11  # px, that of kornia_tidy.reconstruction.metrics
@@ -47,7 +47,7 @@ NETWORK_RUN: dict[str, Any] = {
     "learn": "network", "head": "nafnet", "closed_form": True, "width": 16, "size": 256, "crop": None, "scenes": 1000,
     "validation_scenes": 24, "batch": 4, "lr": 2e-3, "schedule": "cosine", "loss": "charbonnier", "epochs": 24,
 }  # fmt: skip
-"""Settings of a run of the network alone that differ from the defaults, which are the paper's for both."""
+"""Settings of a run of only the network that differ from the defaults, which are the paper's for both."""
 
 JOINT_RUN: dict[str, Any] = {"depth_classes": 21, "refocus": 9, "depth_weight": 0.03}
 """Settings of a run for image and depth that begins with the closed form: the loss of a distribution of depth is about
@@ -124,7 +124,7 @@ class LearningSettings:
         batch: scenes in a batch.
         accumulate: batches in a step.
         epochs: passes over the scenes.
-        pretrain_epochs: passes before, of the network alone with a fixed Fresnel lens; the paper takes 300.
+        pretrain_epochs: earlier passes of only the network, with a fixed Fresnel lens; the paper takes 300.
         patience: epochs without improvement after which the run stops. None: it does not stop early.
         ema: decay of the moving average of the network's weights; 0: none.
         loss: of image and depth, see :data:`LOSS`.

@@ -46,7 +46,7 @@ def _estimated(scores: dict[str, float]) -> str:
     if "depth_rmse" not in scores:
         return "**No depth estimate**: this camera has no network for depth. Trained systems *joint* have one."
     return (
-        f"**Estimated depth** from the capture alone. RMSE {scores['depth_rmse']:.2f} of the range in inverse depth; "
+        f"**Estimated depth** from only the capture. RMSE {scores['depth_rmse']:.2f} of the range in inverse depth; "
         f"one depth everywhere would have {scores['mean_rmse']:.2f}."
     )
 

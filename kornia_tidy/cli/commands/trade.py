@@ -21,7 +21,7 @@ class Trade:
     """Measure speed against accuracy.
 
     The speed-accuracy trade-off is measured on one scene and this machine. Each setting of
-    the fidelity is varied alone from a preset. The presets, and the plans for this scene
+    the fidelity is varied by itself from a preset. The presets, and the plans for this scene
     within errors of 1e-1 to 1e-6, are also measured. For each point the table has the
       error    of the noise-free capture in linear light, full scale 1, against the preset
                'reference', which is rendered once
@@ -65,7 +65,7 @@ figure to trade.png and a table to the screen. After Ctrl-C the same command con
 Another scene, machine or version of the code starts anew.
 
 No setting can lower the error below that of the other settings. With an exact but slow
-base, --base reference, the error of each setting alone is measured.
+base, --base reference, the error of each single setting is measured.
 
 Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
 environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.

@@ -37,7 +37,7 @@ class Setting(NamedTuple):
 
 
 def sweep_settings(base: str | Fidelity = "balanced", knobs: Sequence[str] = tuple(SWEEP_VALUES)) -> list[Setting]:
-    """Return the points of a sweep: the presets, and each setting varied alone while the others stay at the base.
+    """Return the points of a sweep: the presets, and each setting varied while the others stay at the base.
 
     The value of the base is part of every sweep. ``enclosed_energy`` raises ``max_window`` to that of the reference,
     since a smaller window could not hold the light.
