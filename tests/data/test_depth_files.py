@@ -67,20 +67,6 @@ class TestReadDepth(BaseTester):
         assert valid.flatten().tolist() == [value is not None for value in expected]
         self.assert_close(depth[valid], torch.tensor([v for v in expected if v is not None]).float(), rtol=1e-6, atol=0)
 
-    @pytest.mark.parametrize("suffix", [".png", ".tiff", ".pgm"])
-    def test_feature_16_bit_formats(self, suffix, tmp_path):
-        stored = np.random.default_rng(0).integers(1, 65536, (9, 7), dtype=np.uint16)
-        cv2.imwrite(str(tmp_path / f"a{suffix}"), stored)
-        depth, _ = read_depth(tmp_path / f"a{suffix}")
-        np.testing.assert_array_equal(depth[0], stored)
-
-    @pytest.mark.parametrize("suffix", [".pfm", ".tiff"])
-    def test_feature_float_formats(self, suffix, tmp_path):
-        stored = np.random.default_rng(0).uniform(0.1, 9, (9, 7)).astype(np.float32)
-        cv2.imwrite(str(tmp_path / f"a{suffix}"), stored)
-        depth, _ = read_depth(tmp_path / f"a{suffix}")
-        np.testing.assert_array_equal(depth[0], stored)
-
     @pytest.mark.parametrize(
         ("options", "message"),
         [

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
 
 from kornia_tidy import DefocusRange
-from kornia_tidy.data import FlyingThings3D, UnreadableItemError, paper_patches, split_frames
+from kornia_tidy.data import FlyingThings3D, paper_patches, split_frames
 from tests.base import BaseTester, shared
 from tests.data.published import flying_things_disparity, write_flying_things, write_pfm
 
@@ -24,13 +22,6 @@ def root(tmp_path_factory):
 
 
 class TestFlyingThings3D(BaseTester):
-    def test_smoke_sample(self, root):
-        sample = FlyingThings3D(root)[1]
-        assert sample["image"].shape == (3, 12, 20)
-        assert sample["depth"].shape == sample["mask"].shape == (1, 12, 20)
-        assert (sample["index"], sample["name"]) == (1, "TRAIN/A/0000/left/0007")
-        assert sample["mask"].all()
-
     @pytest.mark.parametrize(
         ("options", "first", "length"),
         [
@@ -119,21 +110,6 @@ class TestFlyingThings3D(BaseTester):
             FlyingThings3D(tmp_path, subsets="A")
         assert len(FlyingThings3D(tmp_path, subsets="A", view="right")) == 4
 
-    @pytest.mark.parametrize("file", ["disparity/{}.pfm", "frames_cleanpass/{}.png"])
-    def test_exception_a_broken_file_is_named_with_its_index(self, tmp_path, file):
-        write_flying_things(tmp_path, {"TRAIN/A": 2})
-        name = "TRAIN/A/0001/left/0006"
-        path = tmp_path / file.format(name)
-        path.write_bytes(path.read_bytes()[:-20])
-        data = FlyingThings3D(tmp_path, subsets="A")
-        message = rf"^item 2 of FlyingThings3D, {name}: cannot read .*{file.format(name)}"
-        with pytest.raises(UnreadableItemError, match=message):
-            data[2]
-        path.unlink()
-        with pytest.raises(UnreadableItemError, match=f"{message}: there is no such file"):
-            data[2]
-        assert data[3]["index"] == 3
-
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
@@ -189,25 +165,6 @@ class TestPaperPatches(BaseTester):
         assert sample["image"].shape == (3, 278, 278)
         assert sample["index"] == length - 1
         self.assert_close(sample["depth"], 255 / 8 * sample["image"][:1] / 160)
-
-    def test_feature_no_sequence_is_in_two_splits(self, large):
-        """Every tenth sequence is held out: of 24 the tenth and the twentieth."""
-        frames = {}
-        for split in ("train", "val", "test"):
-            patches = paper_patches(large, split, count=60)
-            frames[split] = {patches[index]["name"].split("@")[0] for index in range(60)}
-        assert frames["val"] == {f"TRAIN/{s}/left/{f}" for s in ("B/0001", "C/0003") for f in ("0006", "0007")}
-        assert len(frames["train"]) == 44
-        assert frames["train"].isdisjoint(frames["val"])
-        assert all(name.startswith("TEST/") for name in frames["test"])
-
-    def test_feature_survives_pickling(self, large):
-        patches = paper_patches(large, "val", count=3, seed=5)
-        assert torch.equal(pickle.loads(pickle.dumps(patches))[2]["depth"], patches[2]["depth"])
-
-    def test_exception_too_few_sequences_to_validate(self, root):
-        with pytest.raises(ValueError, match="has 4 sequences of TRAIN: 10 or more are needed to validate"):
-            paper_patches(root, "val")
 
     def test_exception_names_the_bad_split(self, root):
         with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'dev'"):

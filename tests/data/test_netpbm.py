@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 
-import cv2
 import numpy as np
 import pytest
 
@@ -140,14 +139,6 @@ class TestDecodeNetpbm(BaseTester):
         text = b" ".join(b"%d" % value for value in values.tolist())
         read, _ = decode_netpbm(b"P2 300 1000 65535\n" + text)
         np.testing.assert_array_equal(read.ravel(), values)
-
-    @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-    @pytest.mark.parametrize("channels", [1, 3])
-    def test_feature_opencv_agrees_where_the_maximum_is_that_of_the_type(self, kind, channels, tmp_path):
-        values = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (5, 7, channels)).astype(kind)
-        cv2.imwrite(str(tmp_path / "a.ppm" if channels == 3 else tmp_path / "a.pgm"), values)
-        (path,) = tmp_path.iterdir()
-        np.testing.assert_array_equal(decode_netpbm(path.read_bytes())[0], values[..., ::-1])
 
     @pytest.mark.skipif(shutil.which("pnmtoplainpnm") is None, reason="Netpbm's tools are not installed")
     def test_feature_tools_of_netpbm_write_the_same_numbers(self):

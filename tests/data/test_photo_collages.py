@@ -8,11 +8,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from kornia.color import rgb_to_linear_rgb
 
-from kornia_tidy.data import PhotoCollages, photo_collage, photographs_in
+from kornia_tidy.data import photo_collage, photographs_in
 from kornia_tidy.data import photo_collages as module
 from kornia_tidy.data.photo_collages import _cut, displaced, grain
 from tests.base import BaseTester
@@ -66,24 +64,6 @@ class TestPhotoCollage(BaseTester):
             monkeypatch.setattr(module, share, value)
             scenes.append(photo_collage(photographs_in(folder), 64, 64, depth_range=(1.0, 2.0), seed=4))
         return scenes
-
-    @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 50), (7, 3), (33, 64), (130, 20)])
-    def test_cardinality(self, height, width, folder):
-        image, depth = photo_collage(photographs_in(folder), height, width)
-        assert image.shape == (3, height, width)
-        assert depth.shape == (1, height, width)
-        assert image.is_contiguous()
-
-    def test_feature_the_seed_decides_whatever_the_global_state(self, folder, varied):
-        paths = photographs_in(folder)
-        first = photo_collage(paths, 48, 40, seed=5)
-        np.random.seed(123)  # noqa: NPY002 - the legacy global state is what must not matter
-        torch.manual_seed(123)
-        state = torch.get_rng_state()
-        second, other = photo_collage(paths, 48, 40, seed=5), photo_collage(paths, 48, 40, seed=6)
-        assert torch.equal(torch.get_rng_state(), state)
-        assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-        assert (first[0] != other[0]).float().mean() > 0.9
 
     def test_feature_pixels_are_of_the_photographs_and_at_outlines_quarters_of_them_in_linear_light(self, folder):
         """Each of a pixel's four samples shows one of the photographs; all mixtures of four of them are listed."""
@@ -208,36 +188,6 @@ class TestPhotoCollage(BaseTester):
         means = [np.mean(values) for values in nearness.values()]
         assert abs(means[0] - means[1]) < 0.15  # of 1 m; a scene's own mean varies by .2, so that of 40 by .03
         assert min(np.std(values) for values in nearness.values()) > 0.15
-
-    @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
-    @given(
-        st.tuples(st.integers(1, 24), st.integers(1, 24)), st.integers(0, 2**64), st.floats(0.01, 10),
-        st.floats(1.01, 1e6),
-    )  # fmt: skip
-    def test_property_values_stay_within_their_ranges(self, folder, varied, size, seed, near, ratio):
-        image, depth = photo_collage(photographs_in(folder), *size, depth_range=(near, near * ratio), seed=seed)
-        assert bool(((image >= 0) & (image <= 1)).all())
-        assert bool(((depth >= np.float32(near)) & (depth <= np.float32(near * ratio))).all())
-
-    @pytest.mark.parametrize(
-        ("changed", "message"),
-        [
-            ({"height": 0}, "height must be a positive integer, got 0"),
-            ({"seed": -1}, "seed must be an integer of 0 or more, got -1"),
-            ({"depth_range": (2.0, 1.0)}, r"0 < near < far, got \(2.0, 1.0\)"),
-            ({"photographs": []}, "photographs must hold one path or more, got none"),
-        ],
-    )
-    def test_exception_names_the_bad_value(self, changed, message, folder):
-        given = {"photographs": photographs_in(folder), "height": 8, "width": 8, **changed}
-        with pytest.raises(ValueError, match=message):
-            photo_collage(**given)
-        with pytest.raises(ValueError, match=message):
-            PhotoCollages(**{**given, "length": 2})
-
-    def test_exception_a_data_set_without_scenes(self, folder):
-        with pytest.raises(ValueError, match="length must be a positive integer, got 0"):
-            PhotoCollages(photographs_in(folder), 0, 8, 8)
 
     def test_exception_a_photograph_that_cannot_be_read(self, tmp_path):
         (tmp_path / "a.png").write_bytes(b"no picture")

@@ -49,10 +49,6 @@ def enlarged(suffix: str) -> bytes:
 
 
 class TestCheckHeader(BaseTester):
-    @pytest.mark.parametrize("suffix", SUFFIXES)
-    def test_feature_whole_files_pass(self, suffix):
-        check_header(encoded(suffix))
-
     @pytest.mark.parametrize(
         ("suffix", "options"),
         [

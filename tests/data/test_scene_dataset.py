@@ -175,27 +175,3 @@ class TestSceneDataset(BaseTester):
             Stub()[-1]
         assert isinstance(caught.value.__cause__, ValueError)
         assert isinstance(caught.value, ValueError)
-
-
-class TestDeadLeaves(BaseTester):
-    def test_feature_seeds_and_indices_give_unrelated_scenes(self):
-        scenes = [DeadLeaves(3, 16, 16, num_leaves=30, seed=seed)[index] for seed in range(3) for index in range(3)]
-        assert len(torch.stack([scene["image"] for scene in scenes]).unique(dim=0)) == 9
-
-    def test_feature_sky_is_known(self):
-        sample = DeadLeaves(1, 64, 64, num_leaves=60, depth_range=(0.5, float("inf")))[0]
-        assert sample["depth"].isinf().any()
-        assert sample["mask"].all()
-
-    @pytest.mark.parametrize(
-        ("changed", "message"),
-        [
-            ({"length": 0}, "length must be a positive integer, got 0"),
-            ({"width": 0}, "width must be a positive integer, got 0"),
-            ({"depth_range": (2.0, 1.0)}, "0 < near < far"),
-            ({"seed": -1}, "seed must be an integer of 0 or more"),
-        ],
-    )
-    def test_exception_names_the_bad_value_before_any_item_is_asked_for(self, changed, message):
-        with pytest.raises(ValueError, match=message):
-            DeadLeaves(**{"length": 2, "height": 8, "width": 8, **changed})

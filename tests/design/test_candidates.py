@@ -22,18 +22,6 @@ class TestFlatCandidate(BaseTester):
         errors = [flat_candidate(task, f_number, 0.5).image_error for f_number in (50, 71, 35, 25, 17.6)]
         assert errors == sorted(errors)
 
-    def test_feature_less_light_wants_a_wider_aperture(self):
-        def best(electrons):
-            task = DesignTask(electrons=electrons)
-            return min((20, 28, 40, 57, 80), key=lambda f_number: flat_candidate(task, f_number, 0.5).image_error)
-
-        assert best(100) < best(100_000)
-
-    def test_feature_depth_is_told_by_a_wide_lens_focused_at_an_end(self):
-        task = DesignTask(depth_weight=1.0)
-        wide, stopped = flat_candidate(task, 17.6, 0.0), flat_candidate(task, 80.0, 0.0)
-        assert wide.depth_error < stopped.depth_error
-
 
 class TestCodedCandidate(BaseTester):
     def test_feature_steps_lower_the_cost(self):

@@ -68,26 +68,6 @@ class TestDepthConfusion(BaseTester):
         spread = ((place - (shares * place).sum()).square() * shares).sum().sqrt()
         self.assert_close(depth_confusion(alike, 1e-3, SCENES).depth, spread)
 
-    def test_feature_depth_is_better_known_the_more_the_blur_differs(self):
-        errors = [
-            float(depth_confusion(bank_of(discs(torch.linspace(2, 2 + step, 5).tolist())), 1e-3, SCENES).depth)
-            for step in (0.1, 1.0, 4.0)
-        ]
-        assert errors == sorted(errors, reverse=True)
-        assert errors[-1] < 0.5 * errors[0]
-
-    def test_feature_a_focus_in_the_middle_is_ambiguous(self):
-        """Blur is the same on both sides of the focus; from an end it tells every depth."""
-        middle, end = discs([4.0, 2.0, 0.5, 2.0, 4.0]), discs([0.5, 1.4, 2.3, 3.2, 4.0])
-        middle, end = (float(depth_confusion(bank_of(psfs), 1e-3, SCENES).depth) for psfs in (middle, end))
-        assert end < 0.5 * middle
-
-    def test_feature_noise_hides_depth_and_image(self):
-        psfs = bank_of(discs([1.0, 2.0, 3.0, 4.0]))
-        depths, images = zip(*(depth_confusion(psfs, noise, SCENES) for noise in (1e-3, 1e-2, 1e-1)), strict=True)
-        assert list(depths) == sorted(depths)
-        assert list(images) == sorted(images)
-
     @pytest.mark.parametrize("noise", [0, -1, math.inf, math.nan])
     def test_exception_noise(self, noise):
         with pytest.raises(ValueError, match="noise must be positive and finite, got"):

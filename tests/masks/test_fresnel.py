@@ -4,7 +4,6 @@ import math
 
 import torch
 
-from kornia_tidy.masks.base import mask_coordinates
 from kornia_tidy.masks.fresnel import FresnelLens
 from tests.base import BaseTester
 
@@ -22,8 +21,3 @@ class TestFresnelLens(BaseTester):
         lens = FresnelLens()
         assert list(lens.parameters()) == []
         assert "phase" in lens.state_dict()
-
-    def test_feature_steps_stay_below_half_a_wave_inside_the_aperture(self):
-        x = mask_coordinates(23)[1:-1]
-        quadratic = 10 * x**2
-        assert float(quadratic.diff().abs().max()) < math.pi

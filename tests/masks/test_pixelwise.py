@@ -35,10 +35,6 @@ class TestPixelwiseMask(BaseTester):
         for material in (constant_index(1.5), FUSED_SILICA):
             self.assert_close(PixelwiseMask(initial=heights, material=material).heights(), heights, rtol=1e-6, atol=0)
 
-    def test_feature_the_generator_decides(self):
-        one, two = (PixelwiseMask(generator=torch.Generator().manual_seed(3)).phase for _ in range(2))
-        assert torch.equal(one, two)
-
     def test_feature_half_precision_keeps_the_height(self):
         """Radians keep their precision in half precision; metres of order 1e-7 would not."""
         masks = PixelwiseMask()

@@ -12,14 +12,11 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import (
     GreyLevels,
     PixelCrosstalk,
     StrokeError,
     crosstalk_kernel,
-    level_phases,
     nearest_level,
 )
 from tests.base import BaseTester
@@ -81,31 +78,6 @@ class TestGreyLevels(BaseTester):
         efficiency = float(error.cos().mean() ** 2 + error.sin().mean() ** 2)
         assert efficiency == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=5e-3)
 
-    @pytest.mark.parametrize(("bits", "order"), [(1, 0.4053), (2, 0.8106), (3, 0.9496), (4, 0.9872)])
-    def test_feature_a_stepped_grating_has_goodmans_efficiency(self, bits, order):
-        """First-order efficiencies of 2, 4, 8 and 16 steps from the book; a period is sampled at 1024 points."""
-        ramp = 2 * math.pi * (torch.arange(1024, dtype=torch.float64) + 0.5) / 1024
-        shown = GreyLevels(bits)(ramp)
-        first = torch.polar(torch.ones_like(ramp), shown - ramp).mean()
-        assert float(first.abs() ** 2) == pytest.approx(order, abs=1e-4)
-
-    @pytest.mark.parametrize("bits", [1, 2, 3])
-    def test_feature_the_peak_of_the_psf_falls_by_the_efficiency(self, bits):
-        """A quantised phase ramp focuses off the axis with sinc^2(2^-b) of the peak of the exact ramp."""
-        size = 161  # 17.9 pixels a period, so that phases are spread evenly over a step
-        ramp = 0.35 * torch.arange(size, dtype=torch.float64).expand(size, size)
-        masks = PixelwiseMask(initial=ramp * 530e-9 / math.pi)
-        fidelity = Fidelity(window=41, layer_spacing=40.0, stray_light="discard")
-        panel = SpatialLightModulator(GreyLevels(bits), DwellTimes())
-        with torch.no_grad():
-            exact, stepped = (
-                TiDyOptics(masks, modulator=m, fidelity=fidelity).psf_bank(1, defocus=[0.0]).psfs[0, 0]
-                for m in (DwellTimes(), panel)
-            )
-        peak = int(exact.argmax())
-        assert abs(peak % 41 - 20) > 5
-        assert float(stepped.flatten()[peak] / exact.max()) == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=0.01)
-
     @settings(max_examples=100)
     @given(
         levels=st.lists(st.floats(0, 9), min_size=1, max_size=20),
@@ -150,11 +122,6 @@ class TestGreyLevels(BaseTester):
         panel, phase = GreyLevels(3), 6 * torch.rand(2, 5, 5)
         compiled = torch.compile(panel, backend="eager", fullgraph=True)
         self.assert_close(compiled(phase), panel(phase), rtol=0, atol=0)
-
-    def test_feature_level_phases_wrap_after_the_last(self):
-        phases = level_phases(4)
-        self.assert_close(phases.diff(), torch.full((15,), math.pi / 8, dtype=torch.float64))
-        assert int(nearest_level(torch.tensor(2 * math.pi - 0.01), phases)) == 0
 
 
 class TestStrokeError(BaseTester):

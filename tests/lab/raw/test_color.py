@@ -55,11 +55,6 @@ class TestCameraToSrgb(BaseTester):
         with pytest.raises(ValueError, match="must respond to white in every channel, got"):
             camera_to_srgb(-tensor(G2))
 
-    def test_cardinality(self, dtype):
-        matrix, daylight = camera_to_srgb(tensor(G1).to(dtype))
-        assert (matrix.shape, daylight.shape) == ((3, 4), (4,))
-        assert matrix.dtype == daylight.dtype == dtype
-
     def test_convention_constants_are_those_of_srgb(self):
         primaries = colour.RGB_COLOURSPACES["sRGB"].copy()
         primaries.use_derived_matrix_XYZ_to_RGB = True

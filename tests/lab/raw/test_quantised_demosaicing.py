@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 
 from kornia_tidy.lab.raw import demosaic as demosaicing
 from kornia_tidy.lab.raw import quantised_demosaicing
-from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.demosaic import LIBRAW, LIBRAW_LOCAL, LIBRAW_REACH, demosaic, demosaic_to_srgb
-from kornia_tidy.lab.raw.develop import develop
 from kornia_tidy.lab.raw.filter_array import filter_tile
 from kornia_tidy.lab.raw.quantised_demosaicing import (
     FEWEST_ROWS,
@@ -23,7 +21,7 @@ from kornia_tidy.lab.raw.quantised_demosaicing import (
     band_edges,
     demosaic_quantised,
 )
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 
 LOCAL = [
     (letters, name)
@@ -59,14 +57,6 @@ class TestInWholeNumbers(BaseTester):
         whole = demosaic(mosaic, *filter_tile("RGGB"), "libraw_ahd")
         monkeypatch.setattr(demosaicing, "LIBRAW_REACH", 0)
         assert not torch.equal(demosaic(mosaic, *filter_tile("RGGB"), "libraw_ahd"), whole)
-
-    @pytest.mark.parametrize("name", ["ahd", "ppg"])
-    def test_feature_a_cameras_file_too(self, name, monkeypatch):
-        raw = RawCapture.open(shared("data/raw/syoyo+tinydng/colorchart.dng"))
-        monkeypatch.setattr(quantised_demosaicing, "LARGEST_BAND", 1 << 18)
-        bands = develop(raw, f"libraw_{name}")
-        monkeypatch.setattr(demosaicing, "LIBRAW_LOCAL", ())
-        assert torch.equal(bands, develop(raw, f"libraw_{name}"))
 
     def test_feature_values_come_back_to_half_a_step(self):
         mosaic = torch.rand(2, 130, 8) * 3 - 1

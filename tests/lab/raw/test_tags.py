@@ -16,19 +16,6 @@ COUNTS = np.random.default_rng(0).integers(64, 1000, (36, 48))
 
 
 class TestCameraTags(BaseTester):
-    @pytest.mark.parametrize("order", ["<", ">"])
-    def test_smoke(self, order):
-        assert camera_tags(dng(COUNTS, order=order)) == {
-            "make": "Maker",
-            "model": "Model One",
-            "lens": "Prime 35",
-            "iso": 400,
-            "exposure": 0.04,
-            "aperture": 2.8,
-            "focal_length": 0.035,
-            "timestamp": "2024-02-29T12:34:56",
-        }
-
     @pytest.mark.parametrize(
         ("name", "expected"),
         [
