@@ -14,9 +14,10 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.energies import energy_operations
+from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.backend import Work
-from kornia_tidy.render.dispatch import choose
+from kornia_tidy.render.dispatch import choose, refusal
 from kornia_tidy.render.scene import layered_scene
 
 _points = cache(gauss_legendre_order)
@@ -70,6 +71,7 @@ def rendering_work(
     compositing: str = "gather",
     border: str = "reflect",
     double: bool = False,
+    field: Field | None = None,
 ) -> Work:
     """Return the work of rendering a scene through a bank, from the layers of its pixels.
 
@@ -83,6 +85,7 @@ def rendering_work(
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         border: continuation of the image beyond its edges.
         double: in float64.
+        field: where over the picture PSFs are known, of gather and scatter.
 
     Example:
         >>> flat = torch.zeros(1, 1, 64, 64)
@@ -98,4 +101,11 @@ def rendering_work(
     scene = layered_scene(image, defocus, at, psfs, None, compositing, layers, border)
     # A processor's choice looks at the PSFs' values: of one layer, as all of a wide range would take gigabytes.
     one = replace(scene, psfs=psfs[:1]) if psfs.device.type == "cpu" else scene
-    return choose(one).work(scene)
+    backend = choose(one)
+    if field is None:
+        return backend.work(scene)
+    over = replace(scene, psfs=psfs.expand(len(field.points), *psfs.shape), field=field, found={})
+    if refusal(backend, over) is None:
+        return backend.work(over)
+    work = backend.work(scene)  # cell by cell, a value and two gradients
+    return replace(work, operations=3 * work.operations)

@@ -50,7 +50,7 @@ def plan_scene(
 def _through_lens(optics: Any, scene: PlannedScene, size: tuple[int, int], tolerance: float) -> RenderPlan:
     """Return the plan behind a real lens: that of the axis within a part of the tolerance, and places over the field.
 
-    Operations and memory are those of the axis.
+    A place's PSFs count as those of the axis, though they take longer. Occlusion counts as on the axis.
     """
     between = OF_FIELD * tolerance / max(FIELD_ERROR * scene.level, 1e-9)
     between = min(max(between, LEAST_TOLERANCE), MOST_TOLERANCE)
@@ -58,10 +58,14 @@ def _through_lens(optics: Any, scene: PlannedScene, size: tuple[int, int], toler
     plan = scene.plan(tolerance - error if error < tolerance else tolerance)
     fidelity = plan.fidelity.replace(name=f"planned, tolerance {tolerance:g}", field_tolerance=between)
     field = optics.psf_model.with_fidelity(fidelity).field_of(size, optics.field_center)
+    work = scene.work_over_field(plan.fidelity, field)
     return replace(
         plan,
         fidelity=fidelity,
         tolerance=tolerance,
+        operations=work.operations,
+        reference_operations=scene.work_over_field(plan.reference, field).operations,
+        memory_bytes=work.memory,
         predicted_error=plan.predicted_error + error,
         error_parts=(*plan.error_parts, ("PSFs between places of the field", error)),
         field=field.nodes,

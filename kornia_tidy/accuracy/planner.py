@@ -41,6 +41,7 @@ from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, interpolation
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes
+from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
@@ -137,6 +138,17 @@ class PlannedScene:
     def operations(self, fidelity: Fidelity) -> float:
         """Return the operations of a capture with its PSFs, those of float64 counted twice."""
         return self.planner.captures * sum(work.operations for work in self._works(fidelity))
+
+    def work_over_field(self, fidelity: Fidelity, field: Field) -> Work:
+        """Return the work of a capture with its PSFs at the places of a field."""
+        planner, (bank, rendering) = self.planner, self._works(fidelity)
+        layers = "nearest" if fidelity.layers == "nearest" else "linear"
+        if not self._occlusion:
+            given = layers, self._rendered(fidelity), window_side(fidelity), fidelity.double
+            rendering = self._rendering(*given, field)
+        places = len(field.points)
+        operations = planner.captures * (places * bank.operations + rendering.operations)
+        return Work(operations, max(round(planner.captures * places * bank.memory), rendering.memory))
 
     def plan(self, tolerance: float) -> RenderPlan:
         """Return the cheapest candidate predicted to be within the tolerance.
@@ -356,7 +368,9 @@ class PlannedScene:
         return bank_work(planner.model, spectrum, planner.together, fidelity, computed), rendering
 
     @remembered
-    def _rendering(self, layers: str, nodes: tuple[float, ...], window: int, double: bool) -> Work:
+    def _rendering(
+        self, layers: str, nodes: tuple[float, ...], window: int, double: bool, field: Field | None = None
+    ) -> Work:
         planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
         how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
-        return rendering_work(*given, **how)
+        return rendering_work(*given, **how, field=field)

@@ -25,8 +25,7 @@ class RenderPlan:
         window: side of the largest PSF in pixels.
         wavelengths: computed for each layer, and those of the camera's spectrum, which the reference uses.
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
-        field: places along the picture's height and width at which PSFs are computed. Operations and memory are those
-            of one.
+        field: places along the picture's height and width at which PSFs are computed.
     """
 
     fidelity: Fidelity

@@ -430,7 +430,12 @@ class TiDyOptics(CameraState):
         bank, fidelity = pieces[0].bank(), self.psf_model.fidelity
         light = light.repeat(1, bank.psfs.shape[1] // channels, 1, 1)
         how = self.compositing, "nearest" if fidelity.layers == "nearest" else "linear", self.border, fidelity.correlate
-        found = explain(layered_scene(light, defocus, bank.defocus, bank.psfs, bank.veil, *how))
+        field, psfs = None, bank.psfs
+        if self.lens is not None and self.compositing != "occlusion":  # PSFs' values cost nothing
+            center = sample.centers[0] if sample.centers else self.field_center
+            if (field := self.psf_model.field_of((height, width), center)) is not None:
+                psfs = psfs.expand(len(field.points), *psfs.shape)
+        found = explain(layered_scene(light, defocus, bank.defocus, psfs, bank.veil, *how, field))
         return found if len(pieces) == 1 else replace(found, scene=f"{found.scene}, the first of {len(pieces)} pieces")
 
     # ------------------------------------------------------------------ training, data sets, people

@@ -190,8 +190,10 @@ def explain(scene: LayeredScene) -> Explanation:
     (height, width), (batch, channels), side = scene.output_size, scene.image.shape[:2], scene.psfs.shape[-1]
     words = (
         f"{scene.compositing} of {batch} x {channels} channels of {height}x{width} px, {scene.sampled_layers} of "
-        f"{len(scene.psfs)} layers, PSFs of {side}x{side} px"
+        f"{scene.psfs.shape[-4]} layers, PSFs of {side}x{side} px"
     )
+    if scene.field is not None:
+        words += f" at {scene.field.nodes[0]}x{scene.field.nodes[1]} places over the picture"
     objections = {name: why for name, backend in BACKENDS.items() if (why := refusal(backend, scene)) is not None}
     works = {name: backend.work(scene) for name, backend in BACKENDS.items() if name not in objections}
     return Explanation(words, choose(scene).name, works, objections)

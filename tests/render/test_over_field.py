@@ -11,8 +11,9 @@ from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render import over_field
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.dispatch import Rendering, render_layers
+from kornia_tidy.render.dispatch import BACKENDS, Rendering, explain, render_layers
 from kornia_tidy.render.over_field import render_over_field
+from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.kernels.operator_tester import needs_compiler
 
@@ -118,6 +119,19 @@ class TestRenderOverField(BaseTester):
 
         assert torch.autograd.gradcheck(render, (light, psfs), fast_mode=True)
         assert torch.autograd.gradgradcheck(render, (light, psfs), fast_mode=True)
+
+    def test_feature_the_work_is_counted(self):
+        """Of small tiles and of several terms for each layer in them."""
+        (light, defocus), field = scene_of(), Field(SIZE, (3, 2), cell=32)
+        bank = bank_over(field)
+        axis = layered_scene(light, defocus, bank.defocus, bank.psfs[0])
+        given = light, defocus, bank.defocus, bank.psfs
+        works = [BACKENDS["compiled"].work(axis)]
+        works += [BACKENDS["compiled"].work(layered_scene(*given, field=Field(SIZE, (3, 2), cell=c))) for c in (32, 16)]
+        assert works[0].operations < 1.5 * works[0].operations < works[1].operations < works[2].operations
+        told = str(explain(layered_scene(*given, field=field)))
+        assert "3 of 3 layers, PSFs of 9x9 px at 3x2 places over the picture: compiled" in told
+        assert "batched: PSFs that vary over the picture are rendered cell by cell" in told
 
     def test_exception_backends_of_one_psf(self):
         field = Field(SIZE, (2, 2))

@@ -34,6 +34,7 @@ NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 # layer to multiply by a spectrum and to add up.
 _TILE, _PAIR = 100, 14
 _WINDOW = 1e5  # for each window beside those of its samples: what small ones take longer
+_TERMS = 3  # of a PSF over the field: its value and two gradients
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
 
@@ -99,15 +100,24 @@ class CompiledBackend:
         if _Sums(scene).directly:
             blended = 1 if labels.layer_weight is None else 2
             return Work(2 * blended * words * pixels * side**2, 2 * image + kept)
-        size = window_size(side)
-        _, height, width = labels.layer_index.shape
-        grid = Grid(batch, (height, width), side - 1, (size, size))
-        present = grid.present(labels.every(SAMPLE), len(scene.psfs), SAMPLE)
-        pairs, layers = int(present.sum()), int(present.any(0).sum())
-        operations = transform_operations(size, size) * (grid.blocks + pairs + layers)
-        operations = words * (operations + _WINDOW * grid.blocks + size**2 * (_TILE * grid.blocks + _PAIR * pairs))
-        planes = layers + _WINDOW_PLANES * torch.get_num_threads()
-        return Work(operations, planes * itemsize * size**2 + 3 * image + kept, size)
+        height, width = labels.layer_index.shape[1:]
+        sides, threads = (window_size(side), window_size(side)), torch.get_num_threads()
+        if scene.field is not None:
+            edges = scene.places.row_edges, scene.places.column_edges
+            sides = int(edges[0].diff().max()) + side - 1, int(edges[1].diff().max()) + side - 1
+        grid, samples = Grid(batch, (height, width), side - 1, sides), sides[0] * sides[1]
+        present = grid.present(labels.every(SAMPLE), scene.psfs.shape[-4], SAMPLE)
+        blocks, pairs, layers = grid.blocks, int(present.sum()), int(present.any(0).sum())
+        transforms, planes, sums = blocks + pairs + layers, layers + _WINDOW_PLANES * threads, 0
+        if scene.field is not None:  # light in each tile, PSFs in each pair, and x and y times both
+            down, across = scene.field.nodes
+            transforms, planes = _TERMS * blocks + (_TERMS + 1) * pairs, (_WINDOW_PLANES + 2 * _TERMS) * threads
+            sums = _TERMS * 2 * side**2 * across * (pairs + 2 * down * layers * grid.rows)
+            kept += 2 * across * layers * side**2 * itemsize * threads
+            pairs *= _TERMS
+        operations = transform_operations(*sides) * transforms + _WINDOW * blocks + sums
+        operations = words * (operations + samples * (_TILE * blocks + _PAIR * pairs))
+        return Work(operations, planes * itemsize * samples + 3 * image + kept, max(sides))
 
 
 class _Sums:

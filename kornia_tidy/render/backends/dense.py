@@ -7,6 +7,7 @@ differentiated in turn is made by this backend instead.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -32,7 +33,8 @@ class DenseBackend:
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work for the layers in every eighth row and column of the scene."""
-        return dense_work(scene, scene.sampled_layers, at_once=1)
+        work = dense_work(scene, scene.sampled_layers, at_once=1)
+        return work if scene.field is None else replace(work, operations=len(scene.psfs) * work.operations)
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64."""
