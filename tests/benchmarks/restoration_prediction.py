@@ -38,7 +38,7 @@ from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.wiener import TransferMoments, inverse_spectrum, transfer_moments
 from kornia_tidy.render.borders import next_fast_size
 from kornia_tidy.sensor import exposed_sensor
-from tests.benchmarks.heads import RealScenes
+from tests.benchmarks.system_scores import RealScenes
 from tests.scenes import halves
 
 REFERENCE = 17.6  # f-number at which electrons are counted

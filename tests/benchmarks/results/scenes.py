@@ -13,7 +13,7 @@ from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.tasks import metres, normalised_inverse_depth, stretched
-from tests.benchmarks.heads import LARGEST, LEAVES, LEAVES_SEED, LEAVES_SIZE
+from tests.benchmarks.system_scores import LARGEST, LEAVES, LEAVES_SEED, LEAVES_SIZE
 from tests.scenes import ENTRIES, halves, load_scene
 
 REFERENCE = ThinLensCamera()
