@@ -1,13 +1,14 @@
 """The whole camera: an image and its depth come in, a coded capture goes out, and gradients reach the masks.
 
 Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
-exposure (``motion.py``) and the transform of a data set (``dataset_transform.py``). ``samples.py`` reads what a camera
-is given, ``strips.py`` takes large images some rows at a time, ``camera_state.py`` is its state,
-from which ``saved_camera.py`` makes a camera again.
+exposure (``motion.py``), the distortion of a real lens (``lens_distortion.py``) and the transform of a data set
+(``dataset_transform.py``). ``samples.py`` reads what a camera is given, ``strips.py`` takes large images some rows at a
+time, ``camera_state.py`` is its state, from which ``saved_camera.py`` makes a camera again.
 """
 
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.dataset_transform import DatasetTransform
+from kornia_tidy.camera.lens_distortion import distorted
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.camera.saved_camera import camera_of_state
 from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -17,5 +18,6 @@ __all__ = [
     "TiDyOptics",
     "burst",
     "camera_of_state",
+    "distorted",
     "moving_capture",
 ]
