@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any, NoReturn, Self, overload
+from typing import Any, NoReturn, Self
 
 import torch
 from torch import Tensor, nn
@@ -26,7 +26,6 @@ from kornia_tidy.psf.camera_settings import (
     take_over,
     write_settings,
 )
-from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.lens_limits import PARTS
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -143,26 +142,6 @@ class CameraState(nn.Module):
         self.psf_model = self.psf_model.with_window(None)
         return self.psf_model.fitted.side
 
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        field: None = None,
-    ) -> PSFBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        field: Sequence[tuple[float, float]],
-    ) -> FieldBank: ...
-
     def psf_bank(
         self,
         channels: int | None = None,
@@ -170,10 +149,8 @@ class CameraState(nn.Module):
         defocus: Sequence[float] | None = None,
         *,
         field: Sequence[tuple[float, float]] | None = None,
-    ) -> PSFBank | FieldBank:
+    ) -> Any:
         """Return the PSFs of the masks as they are now. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
-        if field is None:
-            return self.psf_model.psf_bank(channels, dtype, defocus)
         return self.psf_model.psf_bank(channels, dtype, defocus, field=field)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:

@@ -34,7 +34,7 @@ from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.field import check_center
+from kornia_tidy.psf.field import Field, check_center
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.wide_psfs import held_nodes
@@ -270,11 +270,11 @@ class TiDyOptics(CameraState):
         Args:
             sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
         """
-        rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
         size = sample.image.shape[-2], sample.image.shape[-1]
         centers = () if self.lens is None else sample.centers or (self.field_center,)
         found = [self.psf_model.field_of(size, center) for center in centers]
         fields = tuple(field for field in found if field is not None)
+        rows = self._rows_at_once(sample, fields) if sample.bytes_at_once > self.memory_budget // 2 else None
         if rows is None:
             image, depth = sample.image.to(sample.dtype), sample.depth.to(sample.dtype)
             light, defocus = self.decode(image), self.defocus(depth)
@@ -308,7 +308,7 @@ class TiDyOptics(CameraState):
         """Return how many rows a capture has."""
         return sample.image.shape[-2] - (self.window - 1 if self.border == "valid" else 0)
 
-    def _rows_at_once(self, sample: Sample) -> int | None:
+    def _rows_at_once(self, sample: Sample, fields: tuple[Field, ...]) -> int | None:
         """Return how many rows fit the memory allowed; None where all do, or the whole image is needed at once."""
         image, depth = sample.image, sample.depth
         learning = torch.is_grad_enabled() and (
@@ -319,8 +319,8 @@ class TiDyOptics(CameraState):
         unseen = self.compositing == "occlusion" and self.border == "zero"
         if learning or torch_mode() & Mode.TRACED or spread or unseen or not len(image):
             return None
-        allowed = self.memory_budget
-        if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed):
+        allowed, points = self.memory_budget, max((len(field.points) for field in fields), default=1)
+        if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed, points):
             allowed //= 2  # the other half is for PSFs
         return None if sample.bytes_at_once <= allowed else rows_at_once(sample, allowed)
 

@@ -190,10 +190,21 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     return seen if isinstance(piece.share, float) and piece.share == 1 else seen * piece.share
 
 
-def comes_in_pieces(model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int) -> bool:
-    """Return whether PSFs of all the camera's range exceed what a memory budget allows them. See :func:`pieces_of`."""
+def comes_in_pieces(
+    model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int, points: int = 1
+) -> bool:
+    """Return whether PSFs of all the camera's range exceed what a memory budget allows them. See :func:`pieces_of`.
+
+    Args:
+        model: this and the next four arguments are those of :func:`pieces_of`.
+        channels: as there.
+        dtype: as there.
+        compositing: as there.
+        budget: as there.
+        points: of the field, behind a real lens.
+    """
     reach = torch.tensor(model.camera.defocus_range, dtype=torch.float64)
-    return _most_layers(model, channels, dtype, reach, compositing, budget)[0] is not None
+    return _most_layers(model, channels, dtype, reach, compositing, budget, points)[0] is not None
 
 
 def layer_bytes(model: PSFModel, channels: int, dtype: torch.dtype) -> tuple[int, int]:

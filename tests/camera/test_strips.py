@@ -7,8 +7,10 @@ import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.camera.samples import read_sample
+from kornia_tidy.camera.strips import rows_at_once
 from kornia_tidy.design.tradeoff.costs import peak_bytes
 from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.pieces import comes_in_pieces, layer_bytes
 from tests.base import BaseTester
 
 
@@ -68,6 +70,16 @@ class TestCaptureInBands(BaseTester):
         banded = optics(image[0].bfloat16(), depth[0])  # float32's round-off may decide for the next bfloat16
         self.assert_close(banded, expected, rtol=2**-7, atol=0)
         assert (banded != expected).float().mean() < 1e-3
+
+    @torch.no_grad()
+    def test_feature_psfs_of_all_places_behind_a_lens_are_counted(self):
+        optics = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity=Fidelity(window=41))
+        of_a_layer = sum(layer_bytes(optics.psf_model, 3, torch.float32))
+        optics.memory_budget = budget = 2 * len(optics.defocus_nodes) * of_a_layer  # enough for one place
+        sample = read_sample(*make_scene(1000, 300), optics)
+        assert not comes_in_pieces(optics.psf_model, 3, torch.float32, "gather", budget)
+        rows = next(optics.strips(sample)).rows.stop
+        assert rows == rows_at_once(sample, budget // 2) < rows_at_once(sample, budget)
 
     @pytest.mark.takes_seconds
     @torch.no_grad()
