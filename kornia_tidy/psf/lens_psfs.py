@@ -199,7 +199,9 @@ class TurnedLens:
         return whole
 
     def _values(self, name: str, polynomials: Tensor) -> Tensor:
-        return torch.tensordot(self.parts[name], polynomials, 1)
+        coefficients, flat = self.parts[name], polynomials.flatten(1)
+        rows = [row @ flat for row in coefficients.view(-1, len(flat))]  # one product would round by how many they are
+        return torch.stack(rows).view(*coefficients.shape[:-1], *polynomials.shape[1:])
 
     def discs(self) -> Tensor:
         """Return centre x, y and radius of the discs that light must pass, (E, 3): first the stop's own."""

@@ -121,11 +121,11 @@ def scattered_energies(waves: Tensor, weights: Tensor, patches: Tensor, rows: Ax
 
 def patches_of(field: Tensor, rows: Axis, columns: Axis) -> Tensor:
     """Return points spread on the grid, patch by patch: (D, C, S) complex to (D, C, T, T)."""
-    parts = []
-    for part in (field.real, field.imag):
-        spread = part[..., None] * columns.kernel  # (D, C, S, T)
-        parts.append(rows.kernel.transpose(1, 2) @ spread)
-    return torch.complex(parts[0], parts[1])
+    down = rows.kernel.transpose(1, 2)
+    real, imaginary = (  # depth by depth, so that none is rounded by how many they are
+        torch.stack([down @ (own[..., None] * columns.kernel) for own in part]) for part in (field.real, field.imag)
+    )
+    return torch.complex(real, imaginary)
 
 
 def _transformed(grid: Tensor, axis: Axis, dim: int) -> Tensor:

@@ -669,9 +669,7 @@ def _live(history: History) -> Finding:
         EVENTS[name](life)
     coded, columns, to_the_bit = WAYS[history.way](life, noise)
     difference = float((coded.double() - expected.double())[..., columns].abs().max())
-    # PSFs behind a real lens are sums of polynomials, in an order that follows the number of depths.
-    exact = to_the_bit and history.camera.lens != "real"
-    return Finding(difference, 0.0 if exact else bound_of(history))
+    return Finding(difference, 0.0 if to_the_bit else bound_of(history))
 
 
 def main() -> int:

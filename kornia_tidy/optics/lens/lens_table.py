@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -82,7 +83,9 @@ class LensTable:
             return torch.where(torch.as_tensor(parity) % 2 == 1, odd, even)
 
         def at_defocus(table: Tensor) -> Tensor:  # (S, F, J) to (F, D, J)
-            return torch.einsum("ds,sfj->fdj", defocus_terms(defocus, self.reach, len(table)), table)
+            terms = defocus_terms(defocus, self.reach, len(table)).T[..., None, None]  # (S, D, 1, 1)
+            total = sum(term * own for term, own in zip(terms, table, strict=True))  # alike for any number of depths
+            return cast("Tensor", total).movedim(0, 1)
 
         edges = self.edges.double().movedim(1, 0)  # (E, H, 2)
         centre_and_radius = torch.tensor([1, 0])

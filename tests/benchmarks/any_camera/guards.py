@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
-from kornia_tidy.sensor.noise import SensorNoise
 from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -20,6 +19,7 @@ from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.reconstruction.trained import any_camera_system
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera
 from tests.benchmarks.any_camera.scores import READ_ELECTRONS, scored_scenes
 from tests.benchmarks.any_camera.training import demosaiced, shifted

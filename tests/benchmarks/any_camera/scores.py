@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from kornia.color import linear_rgb_to_rgb
-from kornia_tidy.sensor.noise import SensorNoise
 from torch import Tensor
 
 from kornia_tidy.files import write_bytes
@@ -23,6 +22,7 @@ from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
+from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import SHIPPED, camera, in_words, pool_names
 from tests.benchmarks.any_camera.training import start
 from tests.benchmarks.results.scenes import BenchScene, real_scenes
