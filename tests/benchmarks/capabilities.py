@@ -29,6 +29,7 @@ from tests.benchmarks.rendering_against_peers import (
     by_one_conv2d,
     by_opencv,
     ikoma_stack,
+    in_turn,
     labels_of,
     load_scene,
     make_bank,
@@ -202,18 +203,6 @@ ROWS = {
 }
 
 
-def least_milliseconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Return the least processor time of each call, the calls in turn, after each was called once."""
-    least = dict.fromkeys(calls, float("inf"))
-    for round_ in range(ROUNDS + 1):
-        for name, call in calls.items():
-            begun = time.process_time()
-            call()
-            if round_:
-                least[name] = min(least[name], 1e3 * (time.process_time() - begun))
-    return least
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -227,7 +216,7 @@ def main() -> None:
         if wanted and name not in wanted:
             continue
         for row in rows(image, psi):
-            times = least_milliseconds({"": row.ours, **row.peers})
+            times = in_turn({"": row.ours, **row.peers}, ROUNDS, time.process_time, min)
             ours = times.pop("")
             for peer, own in times.items():
                 print(f"| {row.what} | {ours:.1f} | {peer} | {own:.1f} | {own / ours:.2f} |", flush=True)

@@ -21,23 +21,12 @@ from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import explain
 from kornia_tidy.render.scene import layered_scene
-from tests.benchmarks.rendering_against_peers import load_scene, make_bank, round_trip
+from tests.benchmarks.rendering_against_peers import in_turn, load_scene, make_bank, round_trip
 from tests.render.scenes import Bank
 
 LAYERS, ROUNDS = 8, 3
 WINDOWS = (65, 129, 257, 513)
 METHODS = ("compiled", "batched", "dense")
-
-
-def least_seconds(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Return the least processor time of each call, the calls in turn."""
-    least = dict.fromkeys(calls, float("inf"))
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            begun = time.process_time()
-            call()
-            least[name] = min(least[name], time.process_time() - begun)
-    return least
 
 
 def gradient_calls(image: Tensor, psi: Tensor, bank: Bank, compositing: str, methods: list[str]) -> dict:
@@ -63,13 +52,13 @@ def measure(window: int) -> None:
     for method in METHODS:
         calls[f"scatter, {method}"] = lambda m=method: render(image, psi, bank, "scatter", layers="nearest", method=m)
     calls |= gradient_calls(image, psi, bank, "gather", ["compiled"])
-    times = least_seconds(calls)
+    times = in_turn(calls, ROUNDS, time.process_time, min)
     unit = times.pop("round trip")
     trip = 2 * image.shape[1] * transform_operations(*scene.padded_size)
-    for name, seconds in times.items():
+    for name, own in times.items():
         work = explanation.works.get(name.removeprefix("gather, "))
         bound = f"{work.operations / trip:.1f}" if work else ""
-        print(f"| {window} | {name} | {1e3 * seconds:.0f} | {seconds / unit:.2f} | {bound} |", flush=True)
+        print(f"| {window} | {name} | {own:.0f} | {own / unit:.2f} | {bound} |", flush=True)
 
 
 def main(windows: list[int]) -> None:

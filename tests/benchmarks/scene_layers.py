@@ -8,7 +8,6 @@ row "PSFs", are computed each time.
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from kornia_tidy import TiDyOptics
 from tests.benchmarks.compiled_captures import depth_of
-from tests.benchmarks.rendering_against_peers import load_scene
+from tests.benchmarks.rendering_against_peers import in_turn, load_scene
 
 PRESENT, ROUNDS, SIDE = (1, 2, 8, 21), 5, 512
 
@@ -28,19 +27,6 @@ def rounded(psi: Tensor, nodes: tuple[float, ...], count: int) -> Tensor:
     own = psi.new_tensor([nodes[round(last * (i + 0.5) / count - 0.5)] for i in range(count)])
     shares = (psi - nodes[0]) / (nodes[-1] - nodes[0])
     return own[(shares * count).long().clamp(0, count - 1)]
-
-
-def seconds_in_turn(calls: dict[int, Callable[[], object]]) -> dict[int, float]:
-    """Return the median processor time of each call, the calls in turn, after each was called once."""
-    found: dict[int, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
-        call()
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            begun = time.process_time()
-            call()
-            found[name].append(time.process_time() - begun)
-    return {name: statistics.median(own) for name, own in found.items()}
 
 
 def works(compositing: str, image: Tensor, psi: Tensor) -> dict[str, Callable[[], object]]:
@@ -80,8 +66,8 @@ def main() -> None:
     for compositing in ("gather", "scatter", "occlusion"):
         by_scene = {count: works(compositing, image, own) for count, own in scenes.items()}
         for name in by_scene[1]:
-            seconds = seconds_in_turn({count: calls[name] for count, calls in by_scene.items()})
-            cells = [f"{1e3 * own:.1f} ({own / seconds[1]:.1f})" for own in seconds.values()]
+            times = in_turn({count: calls[name] for count, calls in by_scene.items()}, ROUNDS, time.process_time)
+            cells = [f"{own:.1f} ({own / times[1]:.1f})" for own in times.values()]
             print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 

@@ -102,14 +102,6 @@ class TestCrop(BaseTester):
 
 
 class TestPatches(BaseTester):
-    def test_smoke(self):
-        patches = Patches(DeadLeaves(2, 40, 50, num_leaves=40), (24, 32))
-        assert len(patches) == 2
-        sample = patches[1]
-        assert sample["image"].shape == (3, 24, 32)
-        assert sample["depth"].shape == sample["mask"].shape == (1, 24, 32)
-        assert sample["index"] == 1
-
     def test_feature_every_scene_is_used_before_one_is_used_again(self):
         patches = Patches(Numbered(7), 5, count=16)
         scenes = [scene_of(patches[index]) for index in range(16)]

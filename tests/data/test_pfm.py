@@ -28,12 +28,6 @@ class TestDecodePfm(BaseTester):
         np.testing.assert_array_equal(values, TOP_DOWN)
         assert values.dtype.isnative
 
-    def test_feature_single_bytes(self):
-        """1.0 is 3f 80 00 00; values that look like blanks and line ends belong to the values."""
-        assert decode_pfm(b"Pf\n1 1\n-1\n\x00\x00\x80\x3f") == 1.0
-        assert decode_pfm(b"Pf\n1 1\n1\n\x3f\x80\x00\x00") == 1.0
-        assert decode_pfm(b"Pf\n1 1\n-1\n\x0a\x20\x0a\x0a").view(np.uint32) == 0x0A0A200A
-
     def test_feature_colour_has_three_channels(self):
         values = decode_pfm(b"PF\n1 2\n-1.0\n" + struct.pack("<6f", 1, 2, 3, 4, 5, 6))
         assert values.tolist() == [[[4, 5, 6]], [[1, 2, 3]]]
