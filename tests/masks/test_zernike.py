@@ -90,3 +90,8 @@ class TestZernikeMask(BaseTester):
         phase = ZernikeMask(200, 100).phase.detach()
         inside = phase[:, circular_aperture(100, 0.023).bool()]
         assert float(inside.square().mean().sqrt()) == pytest.approx(2.05, rel=0.05)
+
+    def test_feature_pixels_hold_the_value_at_their_centre(self):
+        masks = ZernikeMask(initial=torch.eye(55)[[2, 4]])
+        assert float(masks.phase[0, 11, 21].detach()) == pytest.approx(2.0, abs=1e-6)  # 2 x at x = 1
+        assert float(masks.phase[1, 21, 11].detach()) == pytest.approx(math.sqrt(3), abs=1e-6)
