@@ -2,8 +2,8 @@
 
 Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
 exposure (``motion.py``), the distortion of a real lens (``lens_distortion.py``) and the transform of a data set
-(``dataset_transform.py``). ``samples.py`` reads what a camera is given, ``strips.py`` takes large images some rows at a
-time, ``camera_state.py`` is its state, from which ``saved_camera.py`` makes a camera again.
+(``dataset_transform.py``). ``samples.py`` reads the input of a camera, ``strips.py`` takes large images some rows at a
+time, ``camera_state.py`` holds its state, and ``saved_camera.py`` makes a camera from it.
 """
 
 from kornia_tidy.camera.burst import burst

@@ -24,7 +24,7 @@ def burst_shares(shares: Tensor, dead_time: float, exposure: float) -> Tensor:
         exposure: the interval T in seconds, from the start of the first shot to the end of the last.
 
     Returns:
-        (K,). What they lack to one is lost: :math:`(K - 1) t_d / T`.
+        (K,). The rest to one is lost: :math:`(K - 1) t_d / T`.
 
     Raises:
         ValueError: if the dead time is negative, or the burst has no time left to collect light.
@@ -52,12 +52,12 @@ def burst(
 ) -> Tensor:
     """Take one picture through each mask instead of one through all: the same scene, camera and interval.
 
-    Each shot has its share of the interval, less the dead time before the next, and shot, dark and read noise and a
-    converter of its own. One exposure of ``optics`` in the same interval loses no light and reads out once.
+    Each shot has its share of the interval, less the dead time before the next, and its own shot, dark and read noise
+    and conversion. One exposure of ``optics`` in the same interval loses no light and reads out once.
 
     Args:
-        optics: the camera. Its modulator gives masks and dwell shares; what it shows between masks is hidden here, and
-            light that passes beside the mask at all times is in every shot.
+        optics: the camera. Its modulator gives masks and dwell shares; its transitions between masks are hidden here,
+            and light that passes beside the mask at all times is in every shot.
         image: (B, C, H, W) or (C, H, W), in the camera's colour space.
         depth: (B, 1, H, W) or (1, H, W).
         dead_time: seconds between shots in which no light is collected: readout or switching, whichever is longer.

@@ -1,4 +1,4 @@
-"""What a camera has of its PSF model, and its state: weights, settings and PSF window in one ``state_dict``."""
+"""A camera's view of its PSF model, and its state: weights, settings and PSF window in one ``state_dict``."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class CameraState(nn.Module):
     - of another camera is refused, also with ``strict=False``, before any weight of this camera is changed; the
       first difference is named. ``take_over=True`` sets this camera's settings to the saved ones first;
     - without that entry, such as masks alone, loads the weights and measures the window anew for them;
-    - without weights of this camera leaves it as it is.
+    - without weights of this camera does not change it.
 
     The entry is never counted among the missing keys, so that masks alone and files of earlier versions load with
     ``strict=True``. In a larger module's state it stands under the camera's prefix, and ``load_state_dict`` of that
@@ -97,7 +97,7 @@ class CameraState(nn.Module):
         self.register_load_state_dict_post_hook(_measure_window)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; masks, camera, modulator, lens and aperture are of the PSF model too."""
+        """Set an attribute; masks, camera, modulator, lens and aperture are also those of the PSF model."""
         if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
@@ -129,7 +129,7 @@ class CameraState(nn.Module):
         return self.psf_model.fitted.held
 
     def fit_window(self) -> int:
-        """Choose the smallest PSF window that holds the fidelity's share of the light of the masks as they are now.
+        """Choose the smallest PSF window that holds the fidelity's share of the light of the present masks.
 
         It is done on construction, when a part is swapped, and after loading weights that do not tell their window;
         masks in training keep their window until this is called again. A window or a preset that fixes the side is only
@@ -150,7 +150,7 @@ class CameraState(nn.Module):
         *,
         field: Sequence[tuple[float, float]] | None = None,
     ) -> Any:
-        """Return the PSFs of the masks as they are now. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
+        """Return the PSFs of the present masks. See :meth:`kornia_tidy.psf.psf_model.PSFModel.psf_bank`."""
         return self.psf_model.psf_bank(channels, dtype, defocus, field=field)
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
@@ -158,7 +158,7 @@ class CameraState(nn.Module):
         return self.psf_model.state_weights(dtype)
 
     def timeline(self, dtype: torch.dtype) -> Timeline:
-        """Return what the modulator shows of the masks during one exposure, and when."""
+        """Return the modulator's states of the masks during one exposure, and their times."""
         return self.psf_model.timeline(dtype)
 
     def with_fidelity(self, fidelity: str | Fidelity) -> Self:
@@ -178,8 +178,8 @@ class CameraState(nn.Module):
         before. On the CPU values are checked as ever.
 
         Args:
-            depth: depths whose range all scenes keep to, in what the camera takes, such as metres. Default: all of the
-                camera's range. What lies beyond is rendered as its nearest layer.
+            depth: depths that span the range of all scenes, in the camera's unit, such as metres. Default: all of the
+                camera's range. Depths beyond it are rendered as its nearest layer.
 
         Raises:
             ValueError: if a depth is NaN or not positive.
@@ -202,18 +202,18 @@ class CameraState(nn.Module):
             state: index among the states that the modulator shows.
 
         Raises:
-            ValueError: if there is no such state.
+            ValueError: if the state is unknown.
         """
         return self._replace(psf_model=self.psf_model.through_state(state))
 
     def through_moment(self, moment: int) -> Self:
-        """Return this camera with what its modulator shows at one moment shown all the time. The parts are shared.
+        """Return this camera with the modulator's state of one moment shown all the time. The parts are shared.
 
         Args:
             moment: index among the moments of :meth:`timeline`.
 
         Raises:
-            ValueError: if there is no such moment.
+            ValueError: if the moment is unknown.
         """
         return self._replace(psf_model=self.psf_model.through_moment(moment))
 
@@ -269,10 +269,10 @@ class CameraState(nn.Module):
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False, *, take_over: bool = False
     ) -> Any:
-        """Load a camera: weights, and the window where the state has it. See the class for what is refused.
+        """Load a camera: weights, and the window where the state has it. See the class for refusals.
 
         Args:
-            state_dict: what ``state_dict()`` returned, or weights alone.
+            state_dict: result of ``state_dict()``, or only weights.
             strict: refuse missing and unknown weights.
             assign: as in PyTorch.
             take_over: set the settings of this camera's parts to those in the state first, where they differ. Parts of

@@ -25,9 +25,9 @@ class DatasetTransform:
         optics: the camera; shared, so a data set without worker processes sees what training changes.
         seed: None draws noise from torch's global generator, which differs from worker to worker. A number gives each
             item its own noise, the same for any number of workers, for fork and spawn, and in every epoch; and
-            one thread takes the picture, so that its last digits are the same too.
-        key: with a seed, what tells items apart: the name of an entry of the sample, or a function of the sample that
-            returns an integer.
+            one thread takes the picture, so that its last digits are also the same.
+        key: with a seed, identifies the item: the name of an entry of the sample, or a function from the sample to an
+            integer.
         image_key: name of the image in a mapping.
         depth_key: name of the depth in a mapping. Default: ``"depth"`` or ``"mask_depth"``.
         depth_scale: metres in one unit of the depth; 0.001 for millimetres. Whole numbers need it; others are metres.

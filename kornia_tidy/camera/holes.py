@@ -39,10 +39,10 @@ def with_filled(sample: Any, depth: Any, valid: Any, names: Sequence[str] = DEPT
     """Return a sample with its depth filled, and the mask of known pixels where it has a place for one.
 
     Args:
-        sample: a mapping, which gets the mask under ``"valid"``; a named tuple, whose field ``valid``, if it has one,
-            gets it; or another tuple or list ``(image, depth, ...)``, which has no place.
+        sample: a mapping, which gets the mask under ``"valid"``; a named tuple, which gets it in a field ``valid``; or
+            another tuple or list ``(image, depth, ...)``, which has no place for it.
         depth: without holes.
-        valid: where the depth was known. What comes back is False where the sample says so, too.
+        valid: where the depth was known. The returned mask is also False where the sample's is.
         names: under which a mapping may have the depth.
 
     Example:
@@ -82,7 +82,7 @@ def known_in(sample: Mapping[str, Any], valid: Any) -> Any:
     """Return where a depth was known, less the pixels that the mapping says are not valid.
 
     Args:
-        sample: may say so by an entry ``"valid"``, or a ``"mask"`` of bool in the shape of ``valid``.
+        sample: may have an entry ``"valid"``, or a ``"mask"`` of bool in the shape of ``valid``.
         valid: where the depth has no hole, bool.
     """
     if (earlier := sample.get("valid")) is not None:

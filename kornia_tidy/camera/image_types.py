@@ -1,4 +1,4 @@
-"""Types of images: NumPy arrays, PIL images and whole numbers to tensors in [0, 1], and back to what they were."""
+"""Types of images: NumPy arrays, PIL images and whole numbers to tensors in [0, 1], and back."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def image_tensor(image: Any) -> Tensor:
 
     Args:
         image: a tensor (..., C, H, W); an array (H, W), (H, W, C) or (B, H, W, C); or a PIL image in mode L, I;16 or
-            RGB. Floating-point values are taken as they are, 8-bit ones divided by 255, 16-bit ones by 65535.
+            RGB. Floating-point values are not changed, 8-bit ones divided by 255, 16-bit ones by 65535.
 
     Returns:
         The tensor itself if it is floating point, else float32: (..., C, H, W).
 
     Raises:
-        TypeError: if it is none of these, or holds other numbers.
+        TypeError: if it is of another kind, or holds other numbers.
         ValueError: if an array has another number of axes or masked values, or a PIL image another mode.
 
     Example:
@@ -77,7 +77,7 @@ def depth_tensor(depth: Any, scale: float | None = None) -> Tensor:
         Float32, or float64 where it came so; 0 where a masked array is masked.
 
     Raises:
-        TypeError: if it is none of these.
+        TypeError: if it is of another kind.
         ValueError: if an array has another number of axes or several channels, whole numbers come without a scale, or
             it is not positive or is units per metre.
 

@@ -1,4 +1,4 @@
-"""Motion during the exposure: at each moment the modulator's states see the scene as it is then."""
+"""Motion during the exposure: at each moment the modulator's states see the scene of that moment."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def moving_capture(
     is not the motion blur of the picture taken at rest.
 
     Args:
-        optics: the camera. Its modulator says how many moments there are: K masks, and with
-            :class:`~kornia_tidy.modulator.switching.Switching` what lies between them, which follows after all masks.
-            States that are there at once, as with :class:`~kornia_tidy.modulator.modulator.DiffractionEfficiency`, are
-            of one moment and see one scene.
+        optics: the camera. Its modulator gives the number of moments: K masks, and with
+            :class:`~kornia_tidy.modulator.switching.Switching` the transitions, which follow after all masks.
+            Simultaneous states, as with :class:`~kornia_tidy.modulator.modulator.DiffractionEfficiency`, are of one
+            moment and see one scene.
         images: (B, M, C, H, W) or (M, C, H, W) in the camera's colour space, one for each moment in the modulator's
             order. :func:`moment_times` says when they are.
         depths: (B, M, 1, H, W) or (M, 1, H, W).
@@ -117,7 +117,7 @@ def moment_times(optics: TiDyOptics) -> Tensor:
 def state_times(optics: TiDyOptics) -> Tensor:
     """Return the mean time at which each state of the exposure is shown, as a share of the exposure in [0, 1].
 
-    A state that is there all the time is shown in the middle. For scenes, see :func:`moment_times`.
+    A permanent state is shown in the middle. For scenes, see :func:`moment_times`.
 
     Args:
         optics: the camera.
@@ -151,9 +151,9 @@ def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> 
         ValueError: if shapes do not fit.
 
     Convention:
-        - Images are interpolated bilinearly, as they are given: give linear light to interpolate light. Depths are
+        - Images are interpolated bilinearly without decoding: give linear light to interpolate light. Depths are
           those of the nearest pixel, so that no depth appears that the scene does not have; their values stay.
-        - What comes into view repeats the nearest pixel of the border.
+        - Pixels that come into view repeat the nearest pixel of the border.
 
     Example:
         >>> shift = torch.eye(3).repeat(2, 1, 1)
@@ -180,8 +180,8 @@ def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor,
     Args:
         image: (B, C, H, W).
         depth: (B, 1, H, W).
-        flows: (M, 2, H, W) or (B, M, 2, H, W), pixels (x, y): how far what is seen at a pixel *at the moment* has
-            moved since the image; a point seen at p then was at p - flow(p) in the image.
+        flows: (M, 2, H, W) or (B, M, 2, H, W), pixels (x, y): the motion since the image of the point at a pixel *at
+            the moment*; a point seen at p then was at p - flow(p) in the image.
 
     Returns:
         Images (B, M, C, H, W) and depths (B, M, 1, H, W).
@@ -190,7 +190,8 @@ def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor,
         ValueError: if shapes do not fit.
 
     Convention:
-        - As :func:`scenes_by_homography`. What an object uncovers is not known: the flow there decides what is seen.
+        - As :func:`scenes_by_homography`. The background that an object uncovers is unknown: the flow there chooses its
+          pixels.
 
     Example:
         >>> flow = torch.tensor([1.0, 0.0])[None, :, None, None].expand(1, 2, 1, 4)

@@ -109,7 +109,7 @@ def with_capture(
             ``(image, depth, ...)``. A mask of valid pixels is an entry or a field of a named tuple.
         coded: the capture.
         margin: pixels that it lacks on each side.
-        names: of the image, and those that a mapping may have the depth under.
+        names: of the image, and the possible ones of the depth in a mapping.
         crop: crops a map or an image.
 
     Example:
@@ -147,15 +147,15 @@ def read_sample(
     Args:
         image: the image, or a whole sample.
         depth: the depth map, if ``image`` is a tensor.
-        camera: says what it takes.
+        camera: defines the input.
         generator: source of the noise, to be checked before any work.
         deferred: leave the light on an accelerator to :func:`defocus_extremes_in_one_read`.
         field_center: where the middle of each picture lies. Default: the mapping's entry of this name, if it has one.
 
     Raises:
-        TypeError: if image or depth are not floating-point tensors, or the generator is none.
-        ValueError: if shapes or devices do not fit, there is no depth, the light makes no sense, or a depth map that is
-            to be filled has holes alone.
+        TypeError: if image or depth are not floating-point tensors, or the generator is of another type.
+        ValueError: if shapes or devices do not fit, the depth is missing, the light is not finite, or a depth map to be
+            filled consists of holes.
         KeyError: if a mapping has no image or no depth.
     """
     form = None
@@ -208,7 +208,7 @@ def read_sample(
 
 
 def filled_sample(sample: Sample) -> Sample:
-    """Return a sample whose depth has no holes, and whose form holds that depth and the mask of known pixels."""
+    """Return a sample with a depth without holes, and with that depth and the mask of known pixels in its form."""
     depth, valid = fill_holes(sample.depth)
     if sample.form is None:
         return replace(sample, depth=depth)
@@ -227,7 +227,7 @@ def check_light(image: Tensor, camera: CheckedCamera) -> None:
 
     Args:
         image: of any shape, in the camera's colour space.
-        camera: whether it looks at its inputs, and what white is to it.
+        camera: whether it checks its inputs, and its white level.
 
     Raises:
         ValueError: if a value is NaN or infinite, an sRGB value is above 16, or light beyond 1e30.
@@ -298,7 +298,7 @@ def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, 
         image: of the scene, (B, C, H, W).
         depth: of the scene.
         defocus: of the scene in radians.
-        camera: a :class:`~kornia_tidy.TiDyOptics` as it is at one moment.
+        camera: a :class:`~kornia_tidy.TiDyOptics` at one moment.
 
     Returns:
         Lowest and highest defocus in radians, (2,), as far as PSFs are needed for it.
@@ -335,7 +335,7 @@ def warn_of_defocus(extremes: Tensor, camera: CheckedCamera, pixels: int = 0, cl
 
     Args:
         extremes: lowest and highest defocus in radians, (2,).
-        camera: its range of defocus, and what it has told before.
+        camera: its range of defocus, and its earlier warnings.
         pixels: number of all pixels.
         clamped: number of those beyond the range.
     """

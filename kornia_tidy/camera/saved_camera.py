@@ -37,7 +37,7 @@ def camera_of_state(state: Mapping[str, Tensor]) -> TiDyOptics:
     """Return the camera that was saved: every capture is the same to the last bit.
 
     Args:
-        state: what its ``state_dict()`` returned, with the entry of the settings.
+        state: the result of its ``state_dict()``, with the entry of the settings.
 
     Raises:
         ValueError: if the state has no settings, a part is of a class that this package does not offer, or settings and
@@ -74,7 +74,7 @@ def masks_of_state(state: Mapping[str, Tensor]) -> PhaseMasks:
         state: as in :func:`camera_of_state`. Its other parts may be of any class.
 
     Raises:
-        ValueError: if the state has no settings, the family is none of this package, or weights do not fit.
+        ValueError: if the state has no settings, the family is unknown, or weights do not fit.
 
     Example:
         >>> from kornia_tidy.masks import RadialMask
@@ -86,7 +86,7 @@ def masks_of_state(state: Mapping[str, Tensor]) -> PhaseMasks:
 
 
 def modulator_of_state(state: Mapping[str, Tensor]) -> nn.Module | None:
-    """Return the modulator of a camera that was saved; None if its class is none of this package.
+    """Return the modulator of a camera that was saved; None if its class is unknown.
 
     Args:
         state: as in :func:`camera_of_state`.

@@ -21,7 +21,7 @@ class Strip:
         light: (B, C, H, W) linear, in the type that the capture is computed in.
         defocus: (B, 1, H, W) or (1, 1, H, W) radians.
         reach: lowest and highest defocus of all rows in radians, (2,), or their map.
-        border: what lies beyond the light: ``"valid"`` where it reaches as far as the PSFs.
+        border: continuation of the light beyond its edges: ``"valid"`` where it reaches as far as the PSFs.
         rows: of the capture. Default: all.
         fields: of the whole picture, behind a real lens, and where in it the light begins: one, or one for each image.
     """
@@ -43,7 +43,7 @@ class Strip:
 def rows_at_once(sample: Sample, allowed: int) -> int | None:
     """Return how many rows of a capture fit into so many bytes; None for all.
 
-    It is a multiple of those that noise is drawn for at once.
+    It is a multiple of the rows of one noise draw.
 
     Args:
         sample: image and depth.
@@ -68,7 +68,7 @@ def strips_of(
         border: of the capture.
         fields: of the pictures, behind a real lens.
     """
-    sides = "replicate" if border == "zero" else border  # black has no depth of its own
+    sides = "replicate" if border == "zero" else border  # black has no depth
     before = 0 if border == "valid" else radius
     columns = -before, sample.image.shape[-1] + before
     for top in range(0, height, rows):

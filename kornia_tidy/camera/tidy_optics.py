@@ -63,32 +63,32 @@ class TiDyOptics(CameraState):
         camera: turns depth into defocus. Default: 50 mm, f/17.6, focused at 0.595 m, pixels of 8 um, so that depths
             from 0.298 m to infinity span the paper's range of defocus.
         modulator: turns masks into the states shown and their weights. Default: equal dwell times.
-        sensor: noise and digitisation in linear light, full scale 1; None leaves the light as it is.
+        sensor: noise and digitisation in linear light, full scale 1; None does not change the light.
         fidelity: a preset's name (``"paper"``, ``"draft"``, ``"balanced"``, ``"reference"``) or a
             :class:`~kornia_tidy.fidelity.Fidelity`.
         compositing: ``"gather"`` (the paper's equation 1), ``"scatter"`` (conserves flux) or ``"occlusion"`` (near
             things hide far ones; each state of the exposure is rendered, see ``Fidelity.occlusion_states``; not for a
             spectrum with a basis).
         color_space: how images are encoded: ``"srgb"`` (default) is decoded to linear light and encoded after;
-            ``"linear"`` passes untouched, beyond 1 too; ``"paper"`` treats sRGB values as light, as the paper does,
+            ``"linear"`` passes untouched, also beyond 1; ``"paper"`` treats sRGB values as light, as the paper does,
             and then the sensor's units are encoded ones.
         border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"``, or ``"valid"``, which crops image, depth
             and clean image alike to where the whole PSF fits.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel. Images of
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
-            has a reflectance spectrum, and what is red blurs in other PSFs than what is blue.
-        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the pixels whose centres
-            lie in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`. An ``nn.Parameter``, (N, N)
-            or one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
-        check_inputs: look at the values of images and depths before any work, eagerly. What seems to be in another
-            unit (depth in millimetres, images in 0..255 or normalised) is told once, with the remedy.
+            has a reflectance spectrum, and red things have other PSFs than blue ones.
+        aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the pixels with centres
+            in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`. An ``nn.Parameter``, (N, N) or
+            one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
+        check_inputs: look at the values of images and depths before any work, eagerly. Inputs in another unit (depth in
+            millimetres, images in 0..255 or normalised) give one warning with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
             through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
-            a time, with gradients too. That changes nothing but the last digits.
+            a time, also with gradients. That changes nothing but the last digits.
         holes: ``"error"`` refuses a depth of NaN, 0 or less; ``"fill"`` fills such pixels from the nearest known one,
             as :func:`kornia_tidy.data.fill_holes` does, with gradients and in compiled graphs. Like ``check_inputs`` it
             is not part of the state.
-        lens: a :class:`~kornia_tidy.optics.Lens` in whose stop the masks stand, or the name of one, such as
+        lens: a :class:`~kornia_tidy.optics.Lens` with the masks in its stop, or the name of one, such as
             ``"double-gauss-50mm"``, made for the camera's aperture and focus. Its focal length, f-number and focus are
             the camera's. Each pixel sees the PSF of its place in the picture, within the fidelity's
             ``field_tolerance``; :meth:`psf_bank` gives those of single places. Default: an ideal lens.
@@ -99,8 +99,8 @@ class TiDyOptics(CameraState):
         - ``optics(image, depth)``: (B, C, H, W) and (B, 1, H, W), or both without B, to the coded image.
         - ``optics((image, depth, ...))`` to ``(coded, depth, ...)``.
         - ``optics({"image": ..., "depth": ..., ...})`` to the same mapping with ``"image"`` coded, and
-          ``"all_in_focus"`` the clean image. The depth may stand under ``"mask_depth"`` instead; a ``"mask"`` of what
-          is valid is cropped like the depth.
+          ``"all_in_focus"`` the clean image. The depth may stand under ``"mask_depth"`` instead; a ``"mask"`` of valid
+          pixels is cropped like the depth.
         - With ``holes="fill"`` the depth of a tuple or a mapping comes back filled, and a mapping gets ``"valid"``,
           bool in the depth's shape: False in holes, and where a ``"valid"`` or a bool ``"mask"`` that it had was False.
           A named tuple asks for it by a field ``valid``, as :class:`kornia_tidy.data.Scene` has it.
@@ -112,16 +112,17 @@ class TiDyOptics(CameraState):
         KeyError: if a mapping has no image or no depth.
 
     Convention:
-        - Images are RGB; depth is metres (or what the camera takes), ``inf`` allowed.
-        - Optics run in float32 or better, under autocast too; the capture has the image's dtype. Keep depth float32.
+        - Images are RGB; depth is metres (or the camera's unit), ``inf`` allowed.
+        - Optics run in float32 or better, also under autocast; the capture has the image's dtype. Keep depth float32.
         - Defocus beyond the camera's range is clamped to its ends; ``clamped_pixels`` counts them.
         - Noise comes from the global generator, from ``generator=``, or from ``params=`` drawn before by
-          :meth:`draw`. ``eval()`` does not switch it off: a camera has noise at test time too.
+          :meth:`draw`. ``eval()`` does not switch it off: a camera also has noise at test time.
         - The capture is detached inside a DataLoader's worker, and only there; see :meth:`as_transform`.
         - Threads may share a camera while its masks and parts stand still. Where they change meanwhile, as in training,
           give each thread its own copy (``copy.deepcopy``). The order in which threads draw from the global generator
           is open: give each capture its ``generator=``.
-        - ``state_dict()`` holds settings and PSF window too; see :class:`~kornia_tidy.camera.camera_state.CameraState`.
+        - ``state_dict()`` also holds settings and PSF window; see
+          :class:`~kornia_tidy.camera.camera_state.CameraState`.
 
     Source: Shah, Kulshrestha, Metzler: TiDy-PSFs, ICCV 2023.
 
@@ -187,18 +188,18 @@ class TiDyOptics(CameraState):
 
     @classmethod
     def from_preset(cls, name: str, *, generator: torch.Generator | None = None, **overrides: Any) -> Self:
-        """Return a published optical system, its masks as they are before training.
+        """Return a published optical system with untrained masks.
 
         Args:
             name: one of ``tidy-5``, ``tidy-1``, ``fresnel``, ``phasecam3d``, ``ikoma2021``, ``chang2019``,
-                ``liu2022-pixelwise``, ``liu2022-spiral`` and ``sitzmann2018``. What each is, and where every value of
-                it was read or guessed, stands in :data:`kornia_tidy.optics.SYSTEMS`.
+                ``liu2022-pixelwise``, ``liu2022-spiral`` and ``sitzmann2018``. :data:`kornia_tidy.optics.SYSTEMS`
+                describes each system and the source of each value.
             generator: source of the noise that masks start from, where they do. Default: the global generator.
             overrides: arguments of the class that replace the system's, such as ``fidelity``, ``sensor`` or ``camera``.
 
         Raises:
-            ValueError: if there is no system of this name, or an override contradicts another argument.
-            TypeError: if an override is no argument of the class.
+            ValueError: if no system has this name, or an override contradicts another argument.
+            TypeError: if an override is not an argument of the class.
 
         Convention:
             - The fidelity is ``"balanced"``, which samples honestly. ``from_preset("tidy-5", fidelity="paper")`` is the
@@ -374,7 +375,7 @@ class TiDyOptics(CameraState):
             tolerance: root mean square error of the noise-free linear capture against ``reference``, full scale 1.
 
         Returns:
-            A plan for the masks as they are now, whose ``fidelity`` is for :meth:`with_fidelity`.
+            A plan for the present masks; its ``fidelity`` is for :meth:`with_fidelity`.
 
         Raises:
             ValueError: if the batch holds no image, or as for a capture.
@@ -464,7 +465,7 @@ class TiDyOptics(CameraState):
         """Pixels of the last capture whose defocus lay outside the camera's range and was clamped to its end.
 
         Of a burst, those of one shot; of a moving scene, those of all its moments. A capture by a view of this camera,
-        such as ``with_fidelity`` returns, or in another thread counts too.
+        such as ``with_fidelity`` returns, or in another thread also counts.
         """
         return int(self.notes.clamped)
 

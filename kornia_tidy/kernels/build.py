@@ -1,10 +1,10 @@
-"""C sources of this package as libraries: those that a wheel brings, or compiled here when they are first wanted.
+"""C sources of this package as libraries: from a wheel, or compiled here on first use.
 
 A wheel that ``make wheel`` makes holds them for each level of processors of its platform, and the best one that this
 processor can run is loaded: no compiler is needed. Otherwise, and where ``$CC`` names a compiler, the source is
 compiled for this very processor, in seconds, and kept in the user's cache. Each way stands in where the other fails.
-If both do, nothing is lost but speed: whoever asks gets None and takes another way, and one warning says why and what
-it costs.
+If both do, only speed is lost: the caller gets None and computes in torch, and one warning gives the reason and the
+cost.
 
 A wheel's libraries are trusted as the package's Python code beside them is. A library of the cache is loaded only if it
 is whole and the user's own: its name holds a digest of its content, and nobody else may own it or write to it. One that
@@ -60,11 +60,11 @@ class Build:
     """What became of a C source.
 
     Args:
-        library: to call functions of; None if there is none.
+        library: with the functions; None without one.
         path: where the library lies.
         origin: where it comes from, in words: from the wheel, or compiled here.
         threads: whether it shares its work among threads.
-        remark: why there is no library, why it has one thread only, or why it is from the second choice.
+        remark: reason why the library is missing, has only one thread, or comes from the second choice.
     """
 
     library: ctypes.CDLL | None
@@ -89,7 +89,7 @@ def compiled(source: Path, dtype: torch.dtype) -> ctypes.CDLL | None:
         dtype: ``torch.float32`` or ``torch.float64``.
 
     Warns:
-        CompiledCodeWarning: the first time that there is no library, or one without threads, with the reason.
+        CompiledCodeWarning: the first time that the library is missing or has no threads, with the reason.
 
     Example:
         >>> import pytest
@@ -110,7 +110,7 @@ def load(source: Path, dtype: torch.dtype) -> ctypes.CDLL:
     """Return a C source as a library, see :func:`compiled`, or raise an error with the reason for its absence.
 
     Raises:
-        NotBuiltError: if there is no library.
+        NotBuiltError: if the library is missing.
     """
     library = compiled(source, dtype)
     if library is None:
@@ -169,7 +169,7 @@ def _from_wheel(source: Path, dtype: torch.dtype) -> Build:
 
 
 def _load_beside_torch(path: Path) -> ctypes.CDLL:
-    """Load a library that takes OpenMP from whoever has brought it: torch, whose threads it shares in this way.
+    """Load a library that takes OpenMP from torch, and shares its threads.
 
     torch opens it for all libraries of the process, by a name that differs from version to version.
     """
@@ -222,9 +222,9 @@ def _cached(source: Path, name: str, command: list[str]) -> tuple[Path, ctypes.C
 
 @cache
 def target_vector_bytes(compiler: Compiler) -> int:
-    """Return the width in bytes of the vectors that ``vectors.h`` makes of a compiler's target; 0 if it is not told.
+    """Return the width in bytes of the vectors of ``vectors.h`` for a compiler's target; 0 if unknown.
 
-    The compiler is asked, as wrappers, environment and configuration files change what it targets, not options alone.
+    The compiler itself is asked, since wrappers, environment and configuration files also change its target.
     """
     native = NATIVE.get(platform.machine(), "-mcpu=native")
     macros = run([*compiler.program, *FLAGS, native, *compiler.options, "-E", "-dM", str(SHARED)])
@@ -262,10 +262,10 @@ def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
 def cache_folder() -> Path:
     """Return the folder of compiled libraries, which no one else may write to. It is made if it is not there.
 
-    Source: XDG Base Directory Specification, by which a relative ``$XDG_CACHE_HOME`` is ignored.
+    Source: XDG Base Directory Specification, which ignores a relative ``$XDG_CACHE_HOME``.
 
     Raises:
-        OSError: if there is none that can be used.
+        OSError: if no folder can be used.
     """
     try:
         named = os.environ.get("XDG_CACHE_HOME", "")
@@ -292,7 +292,7 @@ def is_ours(status: os.stat_result) -> bool:
 
 
 def _find(folder: Path, name: str) -> Path | None:
-    """Return the library of a name that is whole and ours. What is not is removed, so that it is built again."""
+    """Return the library of a name that is whole and ours. Invalid files are removed and built again."""
     paths: list[Path] = []
     with suppress(OSError):
         paths = sorted(folder.glob(f"{name}-*.so"))

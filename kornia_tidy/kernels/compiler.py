@@ -21,17 +21,17 @@ _hung: list[str] = []  # the reason, once a compiler was ended: no compiler is c
 
 
 class NotBuiltError(RuntimeError):
-    """Why there is no library, in words."""
+    """Reason why the library is missing, in words."""
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler as it is called.
+    """The call of a C compiler.
 
     Args:
         program: the words that start it, such as ``("ccache", "gcc")``.
-        options: what the user wants it to be told, after everything else.
-        version: the first line of what it says of itself.
+        options: the user's options, after all others.
+        version: the first line of its own description.
     """
 
     program: tuple[str, ...]
@@ -44,7 +44,7 @@ def find_compiler() -> Compiler:
     """Return the compiler that ``$CC`` names, or the first of cc, gcc and clang on the path.
 
     Raises:
-        NotBuiltError: if there is none, or it does not even tell its version.
+        NotBuiltError: if no compiler is found, or it does not print its version.
     """
     words = _words(named_compiler())
     if not words:
@@ -62,12 +62,12 @@ def find_compiler() -> Compiler:
 
 
 def named_compiler() -> str:
-    """Return the command in ``$CC``, empty if there is none."""
+    """Return the command in ``$CC``, empty if it is not set."""
     return os.environ.get("CC", "").strip()
 
 
 def _words(command: str) -> list[str]:
-    """Split a command into words; one that is a file as it stands may have spaces in its name."""
+    """Split a command into words; a command that is the name of a file may contain spaces."""
     if _program(command):
         return [command]
     try:
@@ -77,7 +77,7 @@ def _words(command: str) -> list[str]:
 
 
 def _program(name: str) -> str:
-    """Return the path of a program that does not depend on the current folder, empty if there is none."""
+    """Return the path of a program that does not depend on the current folder, empty if it is not found."""
     try:
         return find_program(name)
     except FileNotFoundError:
@@ -99,10 +99,10 @@ def why_no_threads(compiler: Compiler) -> str:
 
 
 def run(command: list[str]) -> str:
-    """Run a compiler and return what it prints. One that hangs is ended with all that it has started.
+    """Run a compiler and return its output. One that hangs is ended with all that it has started.
 
     Raises:
-        NotBuiltError: if it says no, hangs, or is not there.
+        NotBuiltError: if it fails, hangs, or is missing.
     """
     if _hung:
         raise NotBuiltError(_hung[0])
@@ -116,7 +116,7 @@ def run(command: list[str]) -> str:
             text=True,
             errors="replace",
             start_new_session=True,
-            # What it calls itself is not looked up in the current folder either.
+            # Its own calls are not looked up in the current folder either.
             cwd=ROOT,
             env={**os.environ, "PATH": os.pathsep.join(filter(os.path.isabs, os.get_exec_path()))},
         )

@@ -67,8 +67,8 @@ def call_elementwise(
     """Fill a tensor by a function of C, and return it.
 
     Args:
-        function: takes the addresses of the given tensors and of ``out``, how many numbers they hold, what else is
-            given, and the number of threads.
+        function: takes the addresses of the given tensors and of ``out``, the count of their numbers, the other
+            arguments, and the number of threads.
         out: dense, of float32 or float64.
         given: of its shape and type, in any order of memory. None is a null pointer.
         numbers: floats and whole numbers for the function.

@@ -68,7 +68,7 @@ def gather_direct_psf_gradient(
         (D, C, P, P), summed in the same order every time. It has no gradient.
 
     Raises:
-        MemoryError: if there is no memory for the sums; otherwise as :func:`gather_direct`.
+        MemoryError: if memory for the sums is missing; otherwise as :func:`gather_direct`.
     """
     return torch.ops.kornia_tidy.gather_direct_psf_gradient(plane, pixels, layer_index, layer_weight, layers)
 

@@ -1,7 +1,7 @@
 """The libraries of a wheel: each C source for each level of this platform's processors, as `make wheel` asks for them.
 
-``python -m kornia_tidy.kernels.make_libraries FOLDER`` writes them. They are linked with no OpenMP library, since torch
-has opened its own when they are loaded: a second one in the process would keep threads of its own.
+``python -m kornia_tidy.kernels.make_libraries FOLDER`` writes them. They are linked without an OpenMP library, since
+torch has opened one before: a second one in the process would keep separate threads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def make_libraries(folder: Path, machine: str = platform.machine()) -> list[Path
         machine: as :func:`platform.machine` tells it; the compiler must compile for it.
 
     Raises:
-        NotBuiltError: if there is no compiler or it fails.
+        NotBuiltError: if the compiler is missing or fails.
         ValueError: if wheels of that kind of machine have no libraries.
     """
     if sys.platform != "linux" or machine not in LEVELS:
@@ -43,7 +43,7 @@ def make_library(source: Path, dtype: torch.dtype, level: str, folder: Path) -> 
     """Compile a C source for a level of processors into a folder and return the library's path.
 
     Raises:
-        NotBuiltError: if there is no compiler or it fails.
+        NotBuiltError: if the compiler is missing or fails.
     """
     compiler = find_compiler()
     path = folder.absolute() / library_name(source, dtype, level)

@@ -2,7 +2,7 @@ r"""Operator of the energy of many waves by their mutual intensity in C.
 
 .. math:: E_d = \sum_k w_k \, |K_d U_k K_d^T|^2
 
-The formula and its derivation are in :mod:`kornia_tidy.psf.energies`. The gradient of the field is made in C, too.
+The formula and its derivation are in :mod:`kornia_tidy.psf.energies`. The gradient of the field is also computed in C.
 Those of weights and kernels, and gradients of gradients, are made of the waves, one depth at a time.
 """
 
@@ -35,7 +35,7 @@ def mutual_intensity_energies(field: Tensor, weights: Tensor, kernels: Tensor) -
     Raises:
         TypeError: if a data type is not as above.
         ValueError: if shapes do not fit.
-        MemoryError: if there is no memory for a row of pixels.
+        MemoryError: if memory for a row of pixels is missing.
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.mutual_intensity_energies(field, weights, kernels)

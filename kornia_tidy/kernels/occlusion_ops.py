@@ -55,7 +55,7 @@ def occlusion_direct(
         TypeError: if a data type is not as above.
         ValueError: if shapes do not fit, or the output is smaller than a block of 8 x 32 (float64: 8 x 16) pixels; GPUs
             take any size.
-        MemoryError: if there is no memory for the tables.
+        MemoryError: if memory for the tables is missing.
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.occlusion_direct(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)

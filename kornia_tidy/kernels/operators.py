@@ -27,7 +27,7 @@ def define(
         name: of the operator.
         schema: arguments and result, as ``torch.library.define`` takes them.
         on_processor: the implementation.
-        fake: returns the memory of the result, for tensors without memory too.
+        fake: returns the memory of the result, also for tensors without memory.
         backward: its gradient, as ``torch.library.register_autograd`` takes it. Without one it refuses to have any.
         keep: saves what ``backward`` needs.
     """

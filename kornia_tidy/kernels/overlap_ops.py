@@ -27,7 +27,7 @@ from kornia_tidy.kernels.scene_checks import new_pixels, new_plane, new_psfs, re
 from kornia_tidy.kernels.window_sides import is_window_size, needed_side, size_step
 
 SOURCE = KERNELS / "overlap.c"
-NO_LAYER, NO_MEMORY = 1, 2  # what the functions return
+NO_LAYER, NO_MEMORY = 1, 2  # status of the functions
 
 
 @cache
@@ -119,7 +119,7 @@ def gather_overlap(
         TypeError: if a data type is not as above.
         ValueError: if shapes or the size do not fit.
         IndexError: if a pixel lies in no layer.
-        MemoryError: if there is no memory for the spectra.
+        MemoryError: if memory for the spectra is missing.
         NotBuiltError: if the source cannot be compiled.
     """
     return torch.ops.kornia_tidy.gather_overlap(
@@ -146,7 +146,7 @@ def scatter_overlap(
         layer_weight: (B, H, W), or None.
         size: side of a window in samples.
         correlate: with PSFs that are flipped. The gradient of :func:`gather_overlap` with respect to its plane takes
-            the opposite of what that took.
+            the opposite value.
         places: as there.
 
     Returns:
@@ -258,7 +258,7 @@ def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
 
 
 def _check_places(places: list[Tensor], nodes: tuple[int, ...]) -> None:
-    """Refuse places whose tensors do not fit one another or the nodes. Looks at no value."""
+    """Refuse places with tensors that do not fit one another or the nodes. Looks at no value."""
     given = Places(*places)
     for axis, many in zip((given[:3], given[3:]), nodes, strict=True):
         edges, middles, weights = axis

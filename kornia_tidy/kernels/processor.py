@@ -1,8 +1,8 @@
-"""What the processor can do, as the system tells it, and for which levels of processors compiled code may be loaded.
+"""The processor's features by the system, and the levels of processors with loadable compiled code.
 
-A level is a set of instructions that a compiler is told to use (``-march=``): x86-64-v2 is SSE4.2, v3 is AVX2 with FMA,
-v4 is AVX-512; each 64-bit ARM processor runs ``armv8-a``, which has NEON. Linux tells a feature only if it saves its
-registers between threads, so that no other test of the system is needed.
+A level is a set of instructions for a compiler (``-march=``): x86-64-v2 is SSE4.2, v3 is AVX2 with FMA, v4 is AVX-512;
+each 64-bit ARM processor runs ``armv8-a``, with NEON. Linux tells a feature only if it saves its registers between
+threads, so that no other test of the system is needed.
 
 Source: x86-64 psABI, micro-architecture levels; Linux, ``cpufeatures.h``, for the names of features.
 """

@@ -90,7 +90,7 @@ def _recording(tensor: Tensor) -> bool:
 
 
 def _normal_quantile(uniform: Tensor) -> Tensor:
-    """Return the normal quantile Φ⁻¹(u), finite for u = 0 and 1 too. More devices have erfinv than ndtri."""
+    """Return the normal quantile Φ⁻¹(u), also finite for u = 0 and 1. More devices have erfinv than ndtri."""
     eps = torch.finfo(uniform.dtype).eps
     inside = uniform.clamp(eps / 4, 1 - eps / 2)  # 2u - 1 is then exact on the grid of random numbers, and never ±1
     return math.sqrt(2) * torch.erfinv(2 * inside - 1)

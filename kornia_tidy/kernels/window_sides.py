@@ -8,7 +8,7 @@ WIDEST_VECTOR_BYTES = 64  # narrower ones, see vectors.h, divide it: windows are
 
 
 def size_step(dtype: torch.dtype) -> int:
-    """Return the number of samples of which the side of every window is a multiple.
+    """Return the number of samples that divides the side of every window.
 
     Example:
         >>> size_step(torch.float32), size_step(torch.float64)
@@ -34,7 +34,7 @@ def needed_side(size: int, pixels: int, psf_side: int, step: int) -> int:
         size: side of a window, in samples.
         pixels: along the axis.
         psf_side: P, of the PSFs.
-        step: what the side is a multiple of, as :func:`is_window_size` wants it.
+        step: divisor of the side, as for :func:`is_window_size`.
 
     Returns:
         Samples, ``size`` at most.

@@ -27,7 +27,7 @@ class OpenArea(Tensor):
 
     The edge shades no light: it crosses a cell. The field of the cell is that of its open part, so that the fraction
     is its mean amplitude; the light through the cell is the fraction too, and not its square, as through a graded
-    filter (apodisation). What is computed with it, such as ``0.9 * aperture``, is a plain tensor of amplitudes.
+    filter (apodisation). A result computed from it, such as ``0.9 * aperture``, is a plain tensor of amplitudes.
 
     Example:
         >>> half = torch.tensor([[0.5]]).as_subclass(OpenArea)
@@ -62,8 +62,8 @@ def circular_aperture(size: int, pitch: float = 0.1, radius: float = 1.0, *, edg
         size: cells along a side of the grid.
         pitch: side of a cell in pupil radii.
         radius: radius of the disc in pupil radii.
-        edges: "binary" opens each cell whose centre lies within the disc (for a modulator whose cells are open or
-            shut); "area" gives each cell the exact fraction of its area that the disc covers (for a smooth iris).
+        edges: "binary" opens each cell with its centre within the disc (for a modulator with open or shut cells);
+            "area" gives each cell the exact fraction of its area covered by the disc (for a smooth iris).
 
     Returns:
         Amplitude in [0, 1], float64; with "area" an :class:`OpenArea`.

@@ -1,4 +1,4 @@
-"""Functions whose tensors are on the CPU, whatever the default device is."""
+"""Functions with tensors on the CPU for any default device."""
 
 from __future__ import annotations
 

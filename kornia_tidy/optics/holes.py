@@ -12,7 +12,7 @@ from kornia_tidy.checks import check_part, check_values
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.search_path import import_installed
 
-HOLES = ("error", "fill")  # what a camera and its adapters do about holes
+HOLES = ("error", "fill")  # how a camera and its adapters treat holes
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)  # types that torch stores, and neither compares nor gathers
 
 torch.library.define("kornia_tidy::nearest_known", "(Tensor known) -> Tensor")
@@ -43,8 +43,8 @@ def fill_holes(depth: Tensor | np.ndarray) -> tuple[Tensor, Tensor] | tuple[np.n
           (H, W) is filled by itself.
 
     Raises:
-        TypeError: if the depth is no tensor or array, or holds other numbers.
-        ValueError: if the shape is another, or a map has holes alone.
+        TypeError: if the depth is not a tensor or array, or holds other numbers.
+        ValueError: if the shape is another, or a map consists of holes.
 
     Convention:
         - Distances are Euclidean, between the centres of pixels.

@@ -128,15 +128,15 @@ def camera_spectrum(
 
     .. math:: w_{ci} = \frac{1}{|S_i|} \int_{S_i} s_c(\lambda)\, E(\lambda)\, d\lambda
 
-    with the measured sensitivity s and the illuminant E. So narrow lamp lines between the samples are counted too.
+    with the measured sensitivity s and the illuminant E. Narrow lamp lines between the samples are thus also counted.
 
     Args:
         camera: name of a camera in colour-science, "Nikon 5100 (NPL)" or "Sigma SDMerill (NPL)".
         illuminant: name of an illuminant in colour-science, such as "D65", "A" or "FL2".
         samples: number of wavelengths W. For the Nikon, D65 and a flat mask, 7 give the on-axis PSF to 1.3 % on
             average over defocus from -20 to 20 rad, and 16 give it to 0.24 %.
-        reflectance: give each colour of a scene a reflectance spectrum (:func:`smoothest_reflectances`), and so PSFs
-            of its own. On a real scene (Aloe, five random masks, captures with values in [0, 1]) this changes the
+        reflectance: give each colour of a scene a reflectance spectrum (:func:`smoothest_reflectances`), and with it
+            its own PSFs. On a real scene (Aloe, five random masks, captures with values in [0, 1]) this changes the
             capture by 3.5e-4 root mean square with windows of 23 px and by 7.6e-4 with 65 px. The change from
             ``Spectrum.rgb()`` to these wavelengths is as large. Rendering takes 2.3 to 3.1 times as long, because it
             has nine PSF planes instead of three.

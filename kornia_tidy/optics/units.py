@@ -33,7 +33,7 @@ def warn_once(told: set[Hashable] | None, key: Hashable, sentence: str, stacklev
     """Give a warning the first time that its key occurs.
 
     Args:
-        told: keys that were warned of before, to which this one is added. None: those of the whole process.
+        told: keys of earlier warnings; this one is added. None: those of the whole process.
         key: identifies the warning.
         sentence: text of the warning.
         stacklevel: as for ``warnings.warn``.
@@ -179,12 +179,12 @@ def metres_per_unit(scale: float | None, whole: bool, kind: Any) -> float:
 def check_depth_scale(scale: float, stored: np.ndarray) -> None:
     """Raise if a scale is probably units for each metre, as in Open3D, TUM RGB-D and ROS, instead of metres per unit.
 
-    Two conditions must hold. A unit is more than a metre. The near pixels, of which a hundredth is nearer, are at 500 m
+    Two conditions must hold. A unit is more than a metre. The near pixels, at the lowest hundredth, are at 500 m
     or farther, or at 100 km where values have fractions, as depth in kilometres does.
 
     Args:
         scale: metres for each stored unit.
-        stored: known values of a depth map, any shape; those that are not positive and finite do not count.
+        stored: known values of a depth map, any shape; only positive and finite ones count.
 
     Raises:
         ValueError: if both hold.

@@ -119,8 +119,8 @@ def fine_layer_matrix(
     r"""Return the weights that give the PSFs of fine layers, between which pixels mix linearly, from the computed ones.
 
     A straight line through two points of a curve lies to one side of it, off by up to :math:`h^2 f'' / 8`. Layers are
-    moved back by half of that, :math:`(f(\psi - h) - 2 f(\psi) + f(\psi + h)) / 16`, so that what lies between is off
-    by as much to the one side as they are to the other: half the worst error, 0.47 times the root mean square.
+    moved back by half of that, :math:`(f(\psi - h) - 2 f(\psi) + f(\psi + h)) / 16`, so that the error between layers
+    is as large as that at the layers, with the opposite sign: half the worst error, 0.47 times the root mean square.
 
     Args:
         start: see :func:`interpolation_matrix`.

@@ -1,4 +1,4 @@
-r"""The energy that many waves bring to the sensor's pixels: what the PSFs of a bank cost.
+r"""The energy that many waves bring to the sensor's pixels: the costly part of the PSFs of a bank.
 
 .. math:: E_d(p) = \sum_k w_k \sum_{u \in p} \left| K_d U_k K_d^T \right|^2_u
 
@@ -236,7 +236,7 @@ def intensity_energies(field: Tensor, weights: Tensor, left: Tensor, pixels: Ten
     turned = _columns(field * (weights * (1 + 1j))[:, None, None])
     flat, shape = left.flatten(2, 3), (*left.shape[:3], -1, field.shape[-1])  # (D, W, P q, 2N)
     intensity = (flat @ plain).view(shape).mT @ (flat @ turned).view(shape)  # (D, W, P, N, N)
-    return (intensity.flatten(-2) @ pixels.mT).clamp(min=0)  # where there is no light, rounding leaves less than none
+    return (intensity.flatten(-2) @ pixels.mT).clamp(min=0)  # no light: rounding leaves less than zero
 
 
 def _columns(field: Tensor) -> Tensor:
@@ -250,7 +250,7 @@ def _real_rows(numbers: Tensor) -> Tensor:
 
 
 def _in_block(energies: Callable[..., Tensor], *given: Tensor) -> Tensor:
-    """Return the energies of a block, of which only what is given is kept for the backward pass."""
+    """Return the energies of a block; the backward pass keeps only the inputs."""
     with torch.autocast(given[0].device.type, enabled=False):
         return energies(*given) if torch_mode() & Mode.TRACED else _MadeAgain.apply(energies, *given)
 

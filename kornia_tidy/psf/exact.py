@@ -80,7 +80,7 @@ def exact_psf_bank(
             wavelength it is the pixel's side in cycles per pupil radius. May carry gradients.
         window: side P of the PSFs in pixels, odd.
         tolerance: error allowed to the integrals over sensor pixels, see :func:`sensor_kernels`.
-        chromatic_defocus: for each wavelength, what it has more of defocus than the nodes, in radians at 530 nm.
+        chromatic_defocus: defocus of each wavelength in addition to the nodes', in radians at 530 nm.
             Default: nothing, a lens corrected for colour.
         each_state: return the PSFs of each mask, not their average: (D, K C, P, P), those of a mask follow each other.
         remember: keep the sensor kernels, some hundred KiB for each depth and colour, for the next PSFs of this lens.
@@ -89,7 +89,7 @@ def exact_psf_bank(
         A bank whose PSFs sum to their energy; where the spectrum has a basis, one for each channel and reflectance.
 
     Raises:
-        ValueError: if the step is no such length, as where it is given in cycles.
+        ValueError: if the step is not a length, as where it is given in cycles.
 
     Convention:
         - Where ``pupil.fill_factor`` is below 1, the gaps between the squares that modulate are integrated as exactly:

@@ -34,7 +34,7 @@ class Field:
 
     Convention:
         - The middle of the picture is at ``(size - 1) / 2``. PSFs beyond the picture, as of a border, are those of the
-          nearest pixel in it; in a cell whose middle lies in the picture they are continued to first order.
+          nearest pixel in it; in a cell with its middle in the picture they are continued to first order.
 
     Example:
         >>> field = Field((101, 201), (2, 3))
@@ -90,7 +90,7 @@ class Field:
             first: row or column of the picture at which the part begins.
             pixels: of the part.
             most: pixels of a tile.
-            beyond: pixels of a border on either side of the picture, which tiles cover too.
+            beyond: pixels of a border on either side of the picture, which tiles also cover.
 
         Returns:
             Where in the part tiles begin, and its end, (n + 1,) int64; the middles of the picture's tiles, counted from

@@ -76,7 +76,7 @@ class FieldBank:
         return PSFBank(self.psfs[index], self.defocus, self.energy[index])
 
     def between(self, field: Field, pixel: tuple[float, float]) -> PSFBank:
-        """Return the PSFs at a pixel of the picture whose field this bank has the nodes of.
+        """Return the PSFs at a pixel of the picture, from the nodes of its field in this bank.
 
         Args:
             field: where the nodes stand.
@@ -106,7 +106,7 @@ class FieldBank:
 
 @on_cpu
 def check_field(field: Sequence[tuple[float, float]], lens: Lens | None) -> list[tuple[float, float]]:
-    """Return points of the field, or raise ``ValueError`` or ``TypeError`` if they are none or there is no lens."""
+    """Return points of the field, or raise ``ValueError`` or ``TypeError`` without a lens or for other values."""
     if lens is None:
         raise ValueError(
             "field points need a camera with a lens, got none: give it lens='double-gauss-50mm' or another"
@@ -141,7 +141,7 @@ def field_psf_bank(
     Args:
         phase: radians at 530 nm, (K, N, N).
         weights: share of the exposure of each mask, (K,), summing to one.
-        pupil: what the mask's plane lets through besides the lens's stop and rims, which cut it exactly.
+        pupil: transmission of the mask's plane apart from the lens's stop and rims, which cut it exactly.
         spectrum: wavelengths and how the channels weight them.
         dispersion: for each wavelength, the factor from phase at 530 nm to phase there.
         defocus: nodes in radians at 530 nm.
@@ -152,8 +152,8 @@ def field_psf_bank(
         tolerance: error allowed to the integrals over sensor pixels, as for the PSFs of an ideal lens.
 
     Convention:
-        - PSFs of a channel are centred where its light lands on average: what its colours lie apart is in them, what
-          the channels lie apart is not.
+        - PSFs of a channel are centred on its mean position: they contain the lateral colour within the channel, but
+          not between channels.
 
     Example:
         >>> from kornia_tidy.psf import Pupil
@@ -249,7 +249,7 @@ def whole_cells(pupil: Pupil) -> Tensor:
 
 
 def _screens(phase: Tensor, pupil: Pupil, dispersion: float) -> list[Screen]:
-    """Return the fields in the stop: of whole cells, or of what a mask with gaps changes and of the rest."""
+    """Return the fields in the stop: of whole cells, or of a mask's modulating parts and its gaps."""
     cells = pupil.amplitude.shape[-1]
     waves = pupil_field(phase, pupil.amplitude, dispersion)
     whole = whole_cells(pupil)

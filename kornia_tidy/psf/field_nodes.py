@@ -5,7 +5,8 @@ A PSF is a sum over pairs of points of the stop,
 .. math:: h(p) = \sum_{ab} U_a U_b^* \, e^{i (\phi_a(p) - \phi_b(p))}
 
 with the phases of the rays that join stop and pixel. Polynomials over the field that interpolate the factors of all
-pairs interpolate the PSF as well as these. So a few pairs tell, in milliseconds and for any mask, what nodes will do.
+pairs interpolate the PSF as well as these. A few pairs therefore predict the error of nodes, in milliseconds and for
+any mask.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ PARTS: dict[str, tuple[type, str, str]] = {
 """Of each part its type, an example for people, and an attribute that its type must have."""
 
 WIDEST_BLUR = 10  # times the largest window, which then holds 1.3 % of the light: 1 / (pi / 4 * 100)
-LEAST_WINDOW = 41  # px; who allows less than the presets do wants small PSFs, whatever the lens
+LEAST_WINDOW = 41  # px; a smaller limit than that of the presets asks for small PSFs, whatever the lens
 WIDEST_DISC = 257  # px; up to here the window holds the lens's disc
 USUAL_WINDOW = 65  # px; small pictures have smaller ones, which says nothing of the lens
 MOST_LAYERS = 4096
@@ -79,7 +79,7 @@ def fitting_lens(
 
     Raises:
         TypeError: if it is neither.
-        ValueError: if there is no lens of this name, or it is not the camera's.
+        ValueError: if no lens has this name, or it is not the camera's.
 
     Example:
         >>> fitting_lens("single-50mm", ThinLensCamera(), Fidelity(), Spectrum.rgb()).name

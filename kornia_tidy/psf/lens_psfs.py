@@ -21,7 +21,7 @@ from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.scattered_transform import patches_of, scattered_axis, scattered_energies
 
 _LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
-_BEYOND = 1.5  # times the lens's range, by which PSFs within it may be interpolated
+_BEYOND = 1.5  # times the lens's range; PSFs within it may be interpolated
 _GRID = 41  # points along the stop at which the steepest phase is looked for
 
 
@@ -114,7 +114,7 @@ def lens_light(spans: Tensor, transmission: Tensor, turned: TurnedLens, toleranc
 def turned_lenses(
     lens: Lens, field: Sequence[tuple[float, float]], defocus: Sequence[float], wavelength: float
 ) -> list[TurnedLens]:
-    """Return a lens as it is seen from points of the field.
+    """Return a lens with the view from points of the field.
 
     Args:
         lens: in front of the sensor.
@@ -123,11 +123,11 @@ def turned_lenses(
         wavelength: in metres.
 
     Convention:
-        - Nothing is told of what lies beyond the lens's table: PSFs are interpolated from some that do.
+        - Points beyond the lens's table give no warning: only interpolation needs them.
     """
     psi = torch.tensor(defocus, dtype=torch.float64)
     heights = torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64)
-    # PSFs are as fine as the lens's whole range asks, or a multiple of it: what they are computed with is no matter.
+    # PSFs are as fine as the lens's whole range asks, or a multiple of it, whatever they are computed with.
     times = max(1, math.ceil(float(psi.abs().max()) / (_BEYOND * max(map(abs, lens.table.reach)) or 1.0)))
     ends = times * torch.tensor(lens.table.reach, dtype=torch.float64)
     found = []

@@ -63,8 +63,8 @@ class PSFBank:
         """Return a bank in which the light outside the window is dealt with.
 
         Args:
-            kind: ``"renormalize"`` scales each PSF to a sum of one; ``"veil"`` keeps the PSFs and spreads what they
-                miss over the image; ``"discard"`` loses it.
+            kind: ``"renormalize"`` scales each PSF to a sum of one; ``"veil"`` keeps the PSFs and spreads the missing
+                light over the image; ``"discard"`` loses it.
             basis: PSFs a channel, see :class:`~kornia_tidy.optics.spectrum.Spectrum`.
         """
         check_choice("stray_light", kind, STRAY_LIGHT)
@@ -79,8 +79,8 @@ class PSFBank:
     def _with_stray_light_of_basis(self, kind: str, basis: int) -> PSFBank:
         """Return the bank of a spectral scene with its stray light; white and uniform colours keep their values.
 
-        A channel sees all light of its own reflectance and none of the others'. What the window holds of each differs,
-        as it does between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.
+        A channel collects all light of its reflectance and no other. The window's share of the light differs between
+        them, as between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.
         """
         seen = torch.eye(basis).to(self.energy)  # (C, B), as many channels as reflectances, at each point of a field
         seen = seen.repeat(self.energy.shape[1] // basis**2, 1)
@@ -94,7 +94,7 @@ class PSFBank:
         return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
 
     def with_tails(self) -> PSFBank:
-        r"""Return a bank whose PSFs are zero nowhere: a thousandth of their light follows :math:`1 / (1 + r^2)`.
+        r"""Return a bank with PSFs that are zero nowhere: a thousandth of their light follows :math:`1 / (1 + r^2)`.
 
         Occlusion looks behind near things through the tails of the far layers' PSFs. Where those are cut to zero it
         finds nothing, and white would darken there: to a half behind the outline of a thing far out of focus before a
@@ -117,7 +117,7 @@ class PSFBank:
         return PSFBank(psfs, self.defocus, self.energy, self.veil)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> PSFBank:
-        """Return the bank on a device and in a data type; None: as it is."""
+        """Return the bank on a device and in a data type; None: unchanged."""
         present = {name: value for name in _FIELDS if (value := getattr(self, name)) is not None}
         return PSFBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
 
@@ -177,8 +177,8 @@ class PSFBank:
 
         Args:
             path: where to.
-            more: what else is to lie in the file, under names with a dot in them.
-            notes: what is to be told about it in words.
+            more: further tensors for the file, under names with a dot in them.
+            notes: its description in words.
 
         Raises:
             FileNotFoundError: if the folder does not exist.
@@ -192,7 +192,7 @@ class PSFBank:
         """Read a bank written by :meth:`save`.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if the file is not a PSF bank, or a value is NaN or infinite.
         """
         stored, notes = read_tensors(path, "PSF bank", device)

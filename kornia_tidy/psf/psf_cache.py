@@ -1,4 +1,4 @@
-"""Which PSFs a scene needs, and a cache of them: while masks and camera stay as they are, each is computed once."""
+"""Which PSFs a scene needs, and a cache of them: while masks and camera do not change, each is computed once."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class BankMemory:
             defocus: nodes in radians.
             build: makes a bank of these states, before anything is done about stray light, for some nodes.
             stray_light: arguments of :meth:`PSFBank.with_stray_light`; the last bank is then kept whole and given out
-                again, so its tensors must not be changed. Default: light outside the window is left alone.
+                again, so its tensors must not be changed. Default: light outside the window is not treated.
         """
         with torch.inference_mode(False), torch.no_grad():  # remembered PSFs serve in training too
             kind = (kind, states.dtype, states.device)

@@ -49,8 +49,8 @@ from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
 
 Points = tuple[tuple[float, float], ...]
 AXIS: Points = ((0.0, 0.0),)
-MOST_FIELDS = 8  # sizes and places of pictures whose nodes are remembered
-MOST_PICTURES = 3  # the same, whose PSFs are: some 70 MB each, for 65 px and 72 nodes
+MOST_FIELDS = 8  # sizes and places of pictures with remembered nodes
+MOST_PICTURES = 3  # the same with remembered PSFs: some 70 MB each, for 65 px and 72 nodes
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
@@ -75,19 +75,19 @@ class PSFModel:
     """A lens whose phase mask changes during one exposure: all that decides how a point of light spreads.
 
     A value: its attributes cannot be set, :meth:`replace` returns another one. The parameters of masks, modulator and
-    camera may change, as in training; PSFs are those of the parameters as they are when PSFs are asked for.
+    camera may change, as in training; PSFs follow the parameters at the time of the request.
 
     Args:
         masks: phase masks. Default: five learnable 23x23 masks of uniform noise.
-        camera: turns depth into defocus. Default: :class:`ThinLensCamera` as it comes.
+        camera: turns depth into defocus. Default: ``ThinLensCamera()``.
         modulator: turns masks into the states shown and their weights; its ``fill_factor``, where it has one, is the
             share of each mask pixel that modulates. Default: equal dwell times.
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
-        aperture: amplitude over the mask's pixels (N, N), of which N is the shorter side, or finer by a whole factor.
-            Default: the pixels whose centres lie in the disc; the smooth disc for ``NoMask``. An ``nn.Parameter``,
+        aperture: amplitude over the mask's pixels (N, N), with N the shorter side, or finer by a whole factor.
+            Default: the pixels with centres in the disc; the smooth disc for ``NoMask``. An ``nn.Parameter``,
             (N, N) or one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
-        lens: a :class:`~kornia_tidy.optics.Lens` whose stop the masks stand in, or the name of one, made for the
+        lens: a :class:`~kornia_tidy.optics.Lens` with the masks in its stop, or the name of one, made for the
             camera's aperture and focus. Its stop and its rims cut the masks exactly, besides ``aperture``. Default: an
             ideal lens.
 
@@ -116,7 +116,7 @@ class PSFModel:
 
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _derived: CachedParts
-    _aperture_mark: object  # another one for each aperture that was set, by which remembered PSFs know it
+    _aperture_mark: object  # another one for each aperture that was set; it identifies remembered PSFs
     # For each moment and state, for their averages, for each number of threads, grid and points of the field; None
     # remembers no PSFs.
     _memories: dict[tuple[int | None, int | None, int, int, Points], BankMemory] | None
@@ -193,7 +193,7 @@ class PSFModel:
         return self._replace(_derived=CachedParts(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
-        """Return a model with other fields. What is not replaced is shared: parts and remembered PSFs."""
+        """Return a model with other fields. All other parts and the remembered PSFs are shared."""
         other = object.__new__(type(self))
         vars(other).update(vars(self), **fields)
         return other
@@ -228,10 +228,10 @@ class PSFModel:
         *,
         field: Sequence[tuple[float, float]] | None = None,
     ) -> PSFBank | FieldBank:
-        """Return the PSFs of the masks as they are now, averaged over the exposure; gradients reach the masks.
+        """Return the PSFs of the present masks, averaged over the exposure; gradients reach the masks.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
-        Without gradients, PSFs are remembered while masks and camera stay as they are. Measured PSFs are mixed linearly
+        Without gradients, PSFs are remembered while masks and camera do not change. Measured PSFs are mixed linearly
         between their nodes, as a capture mixes them. Those of one state: ``through_state(k).psf_bank()``.
 
         Args:
@@ -477,7 +477,7 @@ class PSFModel:
                 )
                 for own, share in shown
             ]
-            basis = len(spectrum.basis or (1,))  # whose planes have the light of their channel
+            basis = len(spectrum.basis or (1,))  # with planes that have the light of their channel
             light = banks[0].light.unflatten(2, (-1, basis)).sum(3).repeat_interleave(basis, 2)
             light = torch.where(light == 0, 1, light)[..., None, None]
             psfs = torch.cat([(bank.psfs / light).movedim(0, 1).flatten(1, 2) for bank in banks], 1)
@@ -508,7 +508,7 @@ class PSFModel:
     def states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return the phase of each state over the pupil, (S, N, N) radians, and its share of the exposure, (S,).
 
-        Where each mask has an amplitude of its own the share is that of the light.
+        Where each mask has its own amplitude the share is that of the light.
         """
         shown = timeline_of(self.modulator, self.masks.phase.to(dtype))
         if self.moment is not None:
@@ -522,14 +522,14 @@ class PSFModel:
         return (states if states.shape[-1] == states.shape[-2] else central_square(states)), weights
 
     def timeline(self, dtype: torch.dtype) -> Timeline:
-        """Return what the modulator shows of the masks during one exposure, and when."""
+        """Return the modulator's states of the masks during one exposure, and their times."""
         return timeline_of(self.modulator, self.masks.phase.to(dtype))
 
     def relative_light(self, dtype: torch.dtype) -> Tensor:
         """Return the light that passes at each moment over that of the whole exposure, (M,): 1 of one aperture.
 
         Raises:
-            ValueError: if each mask has an amplitude of its own, and the modulator shows other states than the masks.
+            ValueError: if each mask has its own amplitude, and the modulator shows other states than the masks.
         """
         shown = self.timeline(dtype)
         if not isinstance(self.aperture, LearnableAperture) or self.aperture.amplitude.ndim == 2:
@@ -557,7 +557,7 @@ class PSFModel:
         return self.replace(fidelity=Fidelity.of(fidelity))
 
     def without_memory(self) -> Self:
-        """Return this model without memory of PSFs and of what they are computed with. Parts are shared.
+        """Return this model without memory of PSFs and of intermediate results. Parts are shared.
 
         Example:
             >>> PSFModel().without_memory().psf_bank(defocus=[0.0]).psfs.shape[:2]
@@ -572,7 +572,7 @@ class PSFModel:
             state: index among the states that the modulator shows.
 
         Raises:
-            ValueError: if there is no such state, or PSFs were measured, which are those of the whole exposure.
+            ValueError: if the state is unknown, or PSFs were measured, which are those of the whole exposure.
 
         Example:
             >>> model = PSFModel()
@@ -587,11 +587,11 @@ class PSFModel:
         return self.of_state(state)._replace(_derived=CachedParts(self.fitted))
 
     def of_state(self, state: int) -> Self:
-        """Return this model with one state, unchecked, and what was found for all of them, such as wide blur."""
+        """Return this model with one state, unchecked, and the results found for all of them, such as wide blur."""
         return self._replace(state=state if self.state is None else self.state)
 
     def through_moment(self, moment: int) -> Self:
-        """Return this model with what its modulator shows at one moment shown all the time: one state, or some at once.
+        """Return this model with the modulator's state of one moment shown all the time: one state, or some at once.
 
         The parts and the window are shared.
 
@@ -599,7 +599,7 @@ class PSFModel:
             moment: index among the moments of :meth:`timeline`.
 
         Raises:
-            ValueError: if there is no such moment.
+            ValueError: if the moment is unknown.
 
         Example:
             >>> from kornia_tidy.modulator.modulator import DiffractionEfficiency
@@ -771,7 +771,7 @@ class PSFModel:
     def wide_blur(self) -> WideBlur | None:
         """Layers and grids of a fast lens without a mask; None where masks are shown, or the blur is narrow.
 
-        Found with the masks as they were at the first look, and dropped as soon as they are no longer flat.
+        Found with the masks at the first request, and dropped when they are no longer flat.
         """
         derived = self._derived
         if (derived.blur is None and derived.blur_known) or Mode.GRAPH in torch_mode():
@@ -790,7 +790,7 @@ class PSFModel:
             return None
         if not self.fidelity.blurs_by_rays:
             return None
-        # A focus that is learnt moves the PSFs' sampling; colours with focuses of their own have discs of their own.
+        # A focus that is learnt moves the PSFs' sampling; colours with different focuses have different discs.
         if isinstance(step, Tensor) or any(camera.chromatic_defocus(w) for w in self.spectrum.wavelengths):
             return None
         if not blurs_widely(camera.defocus_range, step) or getattr(self.modulator, "fill_factor", 1) != 1:
@@ -814,7 +814,7 @@ class PSFModel:
     def settings(self) -> dict[str, Any]:
         """Return what shapes the PSFs besides the weights, by the names of the parts."""
         fidelity = settings_of(self.fidelity)
-        fidelity.pop("window")  # the window has an entry of its own
+        fidelity.pop("window")  # the window has a separate entry
         if fidelity["wide_blur"] == Fidelity.wide_blur:  # states of earlier versions do not have it
             fidelity.pop("wide_blur")
         if self.lens is None:  # nor this

@@ -77,7 +77,7 @@ class Pupil:
         return pupil
 
     def of_masks(self, masks: slice) -> Pupil:
-        """Return the pupil of some of the masks: itself, unless each has an amplitude of its own."""
+        """Return the pupil of some of the masks: itself, unless each has its own amplitude."""
         if self.amplitude.ndim == 2:
             return self
         pupil = copy.copy(self)
@@ -134,7 +134,7 @@ def pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> 
 
     Convention:
         - Whole waves are taken off the phase in float64: in float32 the product of 1e4 rad with ``dispersion`` would be
-          off by up to 1e-3 rad. A device without float64 multiplies halves of the numbers, whose products are exact.
+          off by up to 1e-3 rad. A device without float64 multiplies halves of the numbers, with exact products.
 
     Example:
         >>> pupil_field(torch.zeros(1, 2, 2), torch.ones(4, 4), 1.0).shape
@@ -180,8 +180,8 @@ def _upper_digits(number: Tensor) -> Tensor:
 def gapped_pupil_field(phase: Tensor, aperture: Tensor, dispersion: float | Tensor) -> Tensor:
     r"""Return the field behind a mask with gaps between its pixels, to be used with :func:`gapped_cells`.
 
-    Light through the gaps keeps its phase, so the field is that of the open aperture, A on whole cells, plus what the
-    mask changes, :math:`A (e^{i\phi} - 1)`, on the modulating part of each cell.
+    Light through the gaps keeps its phase, so the field is that of the open aperture, A on whole cells, plus the mask's
+    change, :math:`A (e^{i\phi} - 1)`, on the modulating part of each cell.
 
     Args:
         phase: radians at 530 nm, (K, N, N), float32 or float64.

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from kornia_tidy.kernels.window_sides import next_fast_size
 
-_SIGMA = 1.6  # period of the transform over the window: what lies beyond it folds back where it is not looked at
-_DENSITY = 1.5  # samples of the intensity over those that its bandwidth asks for
+_SIGMA = 1.6  # period of the transform over the window: light beyond it folds back outside the used part
+_DENSITY = 1.5  # samples of the intensity over those that its bandwidth needs
 _NODES = 48
 
 
@@ -36,7 +36,7 @@ class Axis:
         start: first sample of the grid that each patch of points touches, (C,).
         kernel: weights of each point on the samples of its patch, (C, S, T).
         extent: samples of the grid that points touch.
-        size: samples of the transform, of which the grid's come first.
+        size: samples of the transform, the grid's first.
         correction: of the transform at the samples kept, (N,): one over the kernel's transform.
         pixels: sums over samples that give the light in pixels, one for each shift, (V, P, N).
     """

@@ -20,11 +20,11 @@ def bin_spectrum(spectrum: Spectrum, count: int) -> Spectrum:
     .. math:: \min_S \sum_i \sum_{\lambda \in S_i} w_\lambda (\lambda - \bar\lambda_i)^2,
         \qquad w_\lambda = \sum_c w_{c\lambda}
 
-    What a PSF loses by is the second order of its change along a slice.
+    The error of a PSF is the second order of its change along a slice.
 
     Args:
         spectrum: the many.
-        count: wavelengths wanted. A spectrum that has no more is returned as it is.
+        count: wavelengths wanted. A spectrum without more wavelengths is returned unchanged.
 
     Returns:
         The channels of ``spectrum``, with the light that they had. A basis becomes its mean in each slice, and is then

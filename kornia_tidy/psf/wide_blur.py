@@ -8,7 +8,7 @@ farther apart for larger discs,
 
 because a change of a large disc is spread over its long edge. Discs of 24 pixels and more are smooth: their layers are
 convolved on a grid of 2, 4, 8, ... pixels, on which the radius is between 12 and 24. Errors are given in
-:data:`GRID_ERROR`, :data:`LAYER_ERROR` and :func:`ray_error`, root mean square for a scene whose standard deviation is
+:data:`GRID_ERROR`, :data:`LAYER_ERROR` and :func:`ray_error`, root mean square for a scene with a standard deviation of
 :data:`SCENE_DEVIATION` of full scale (the Aloe scene), in linear light.
 
 All three arise at the edges of a PSF, which is an image of the aperture. Other apertures than the disc have longer

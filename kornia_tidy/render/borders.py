@@ -44,7 +44,7 @@ def largest_window(border: str, height: int, width: int) -> int:
 
 
 def pad_border(image: Tensor, radius: int | tuple[int, int], border: str) -> Tensor:
-    """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` leaves them as they are.
+    """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` does not change them.
 
     Two radii are those left and right, and above and below.
     """
@@ -61,7 +61,7 @@ def extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], bor
         image: (..., H, W).
         rows: first row, and the one beyond the last.
         columns: the same.
-        border: what lies beyond the image.
+        border: continuation of the image beyond its edges.
 
     Example:
         >>> extended(torch.arange(3)[None], (0, 1), (-3, 5), "reflect")

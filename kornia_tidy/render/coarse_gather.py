@@ -3,7 +3,7 @@ r"""Gather on coarse grids: large discs are convolved with an image of fewer pix
 A layer with a large PSF is smooth. Its image is averaged over squares of k pixels, convolved there with the PSF of a
 camera with pixels k times as wide, and interpolated linearly. Averaging twice and interpolating widens the PSF by
 :math:`1/12 + 1/12 + 1/6 = 1/3` of a squared grid pixel on each axis; the PSF is sharpened by as much,
-:math:`h - \Delta h / 6`, so that what is left is of fourth order. Pixels blend their two layers as in
+:math:`h - \Delta h / 6`, so that the rest is of fourth order. Pixels blend their two layers as in
 :func:`kornia_tidy.render.compositing.gather`, and each belongs to the one group of layers that spans its defocus.
 
 A sharpened PSF is negative just outside of the aperture's image: there h is zero, and at a straight edge at most two of
@@ -48,8 +48,8 @@ def gather_group(
         own: which pixels are the group's, bool, as ``defocus``.
         grid: sensor pixels along a side of a pixel of the PSFs.
         margin: pixels that are not seen on each side.
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`. Images smaller than a PSF's radius
-            are reflected several times.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`. Images smaller than a
+            PSF's radius are reflected several times.
 
     Returns:
         (B, C, h, w) light, zero at pixels of other groups. Gradients reach image, defocus and PSFs.

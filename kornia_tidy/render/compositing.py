@@ -57,7 +57,7 @@ def render(
         correlate: flip the PSFs by 180 degrees, as the PhaseCam3D family of codes does.
         method: the backend. ``"auto"`` takes one by a rule, see :func:`kornia_tidy.render.dispatch.choose`;
             ``"compiled"`` (in C), ``"batched"`` (in torch, on any device) and ``"dense"`` (the definition) ask for
-            one. ``torch.func`` and forward-mode derivatives are for dense alone.
+            one. ``torch.func`` and forward-mode derivatives work only with dense.
 
     Returns:
         The coded image in ``image``'s dtype, computed in float32 or better, autocast or not: (B, C, H, W), or
@@ -95,7 +95,7 @@ def gather(
     correlate: bool = False,
     method: str = "auto",
 ) -> Tensor:
-    r"""Convolve the image with each layer's PSF, then blend at each pixel those of its own layers.
+    r"""Convolve the image with each layer's PSF, then blend at each pixel those of its layers.
 
     .. math:: I_c = \sum_d O_d \, (L_c * h_{dc} + v_{dc} \overline{L_c})
 
@@ -110,7 +110,7 @@ def gather(
         veil: v, (D, C) fraction of the image's mean light that is added, or None. With the border ``"zero"`` as much of
             it as stays in the image, see :func:`kornia_tidy.render.stray_light.share_within`.
         layers: ``"linear"`` or ``"nearest"``.
-        border: what lies beyond the image, see :func:`render`.
+        border: continuation of the image beyond its edges, see :func:`render`.
         correlate: flip the PSFs by 180 degrees.
         method: the backend, see :func:`render`.
 
@@ -159,7 +159,7 @@ def scatter(
         veil: v, (D, C) fraction of each layer's mean light that is added, or None. With the border ``"zero"`` as much
             of it as stays in the image, see :func:`kornia_tidy.render.stray_light.share_within`.
         layers: ``"linear"`` or ``"nearest"``.
-        border: what lies beyond the image, see :func:`render`.
+        border: continuation of the image beyond its edges, see :func:`render`.
         correlate: flip the PSFs by 180 degrees.
         method: the backend, see :func:`render`.
 
@@ -195,7 +195,7 @@ def occlusion(
     tails (:meth:`kornia_tidy.psf.psf_bank.PSFBank.with_tails`), as cameras do with measured ones. PSFs are normalised
     by their sums on the way, so light that a bank discards is as if renormalised; in the dark beyond a border of zeros
     there is nothing to be seen, and the image does not darken towards it. Not linear in the PSFs: PSFs averaged over
-    time stand for the states of the exposure only roughly. Computed in float64, see
+    time only approximate the states of the exposure. Computed in float64, see
     :mod:`kornia_tidy.render.backends.dense_occlusion`.
 
     Args:
@@ -208,7 +208,7 @@ def occlusion(
             border ``"zero"`` as much of it as there is among the light seen, see
             :func:`kornia_tidy.render.stray_light.normalised_share`.
         layers: ``"linear"`` or ``"nearest"``.
-        border: what lies beyond the image, see :func:`render`.
+        border: continuation of the image beyond its edges, see :func:`render`.
         correlate: flip the PSFs by 180 degrees.
         method: the backend, see :func:`render`.
 

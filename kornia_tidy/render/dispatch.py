@@ -29,7 +29,7 @@ COMPOSITINGS = ("gather", "scatter", "occlusion")
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DenseBackend(), CompiledBackend(), BatchedBackend())
 }
-# What method= took before.
+# Earlier names of method=.
 RENAMED = {"direct": "compiled", "overlap": "compiled", "tiled": "batched", "triton": "batched"}
 # Where dense is the faster one: occlusion in C takes P^2 operations a pixel, and tiles of a small image through large
 # PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
@@ -42,7 +42,7 @@ class Rendering:
 
     Args:
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        border: what lies beyond the image.
+        border: continuation of the image beyond its edges.
         layers: ``"nearest"`` or ``"linear"``: how pixels between two layers take part in them.
         correlate: whether PSFs are flipped by 180 degrees.
     """
@@ -104,7 +104,7 @@ def render_layers(
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
     """Return the backend that renders a scene.
 
-    Transforms of torch are for dense alone. Accelerators take batched. Processors take compiled, and batched without a
+    Transforms of torch work only with dense. Accelerators take batched. Processors take compiled, and batched without a
     compiler; large PSFs go densely where that is faster, while the planes are small and no gradients are wanted, for
     which dense keeps every spectrum.
 
@@ -154,7 +154,7 @@ def refusal(backend: Backend, scene: LayeredScene) -> str | None:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Which backend renders a scene, and what the others would do, see :func:`explain`.
+    """The backend that renders a scene, and the work of the others, see :func:`explain`.
 
     Args:
         scene: the scene in words.

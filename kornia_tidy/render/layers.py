@@ -22,7 +22,7 @@ def weight_of_layer(layer_index: Tensor, layer_weight: Tensor | None, layer: int
         layer: the layer wanted, or a tensor of layers that broadcasts with the pixels.
 
     Returns:
-        (B, 1, H, W) weight in [0, 1], of ``layer_weight``'s dtype, or bool if that is None.
+        (B, 1, H, W) weight in [0, 1], of ``layer_weight``'s dtype, or bool without it.
     """
     if layer_weight is None:
         return layer_index == layer

@@ -119,7 +119,7 @@ class _Steps:
 
 
 class _Cells:
-    """The PSFs of cells, and what is seen through them. Planes hold the border that PSFs reach."""
+    """The PSFs of cells, and the pixels seen through them. Planes hold the border that PSFs reach."""
 
     def __init__(self, bank: FieldBank, field: Field, rendering: Rendering) -> None:
         self.field, self.rendering, self.bank = field, rendering, bank
@@ -138,7 +138,7 @@ class _Cells:
         return found
 
     def see(self, plane: Tensor, deep: Tensor, inside: Tensor | None = None) -> Tensor:
-        """Return what pixels see by gather or occlusion, (B, C, h, w)."""
+        """Return the pixels rendered by gather or occlusion, (B, C, h, w)."""
         radius, lines, columns = self.radius, [], self._columns(deep, self.radius)
         for down, line in self._lines(deep, radius):
             parts = []
@@ -184,7 +184,7 @@ class _Cells:
         down: _Steps,
         across: _Steps,
     ) -> Tensor:
-        """Return what pixels of a cell see of layers that hide one another, see :func:`lay_over`."""
+        """Return the pixels of a cell for layers that hide one another, see :func:`lay_over`."""
         index, weight = assign_layers(depths, self.bank.defocus[own], self.rendering.layers)
         shown = None if self.rendering.layers == "nearest" else weight.double()
         psfs = (psfs.flip((-2, -1)) if self.rendering.correlate else psfs).double()  # (D, 3, C, P, P)

@@ -51,7 +51,7 @@ class Piece:
         bank: computes the PSFs, or finds them in a memory; a :class:`~kornia_tidy.psf.field_bank.FieldBank` where there
             is a field.
         share: of the exposure; (S,) where the bank holds the PSFs of S states, those of a state after each other.
-        span: defocus in radians from the first to below the second whose pixels are the piece's; None for all.
+        span: the piece has the pixels with a defocus from the first to below the second, in radians; None: all.
         grid: sensor pixels along a side of a pixel of the PSFs.
         window: side in sensor pixels that holds the PSFs of all pieces, where they differ: a border ``"valid"`` crops
             by it.
@@ -85,10 +85,10 @@ def pieces_of(
     device: torch.device | None = None,
     field: Field | None = None,
 ) -> Iterator[Piece]:
-    """Yield what a capture is a sum over: one piece in the ordinary case.
+    """Yield the pieces that add up to a capture: one piece in the ordinary case.
 
     Args:
-        model: as it is at one moment.
+        model: at one moment.
         channels: of the image: those of the spectrum, or 1.
         dtype: float32 or float64.
         reach: lowest and highest defocus of the scene in radians, (2,), or its map.
@@ -150,7 +150,7 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     Args:
         light: (B, C, H, W) linear light.
         defocus: (B, 1, H, W) or (1, 1, H, W) radians.
-        piece: PSFs. Gradients make those that are not kept once more.
+        piece: PSFs. Gradients compute the others again.
         rendering: how.
 
     Example:
@@ -172,7 +172,7 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     inside, gathers = None, rendering.compositing == "gather"
     if piece.span is not None:
         inside = piece.holds(defocus)
-        defocus = torch.where(inside, defocus, bank.defocus[0].to(defocus))  # a layer that is there costs least
+        defocus = torch.where(inside, defocus, bank.defocus[0].to(defocus))  # an existing layer costs least
         light = light if gathers else light * inside
     planes = bank.psfs.shape[-3] // light.shape[1]  # of the scene's colours, where these have spectra, or of states
     if planes > 1:
@@ -193,7 +193,7 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
 def comes_in_pieces(
     model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int, points: int = 1
 ) -> bool:
-    """Return whether PSFs of all the camera's range exceed what a memory budget allows them. See :func:`pieces_of`.
+    """Return whether PSFs of all the camera's range exceed their share of a memory budget. See :func:`pieces_of`.
 
     Args:
         model: this and the next four arguments are those of :func:`pieces_of`.

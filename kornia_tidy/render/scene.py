@@ -61,7 +61,7 @@ class LayeredScene:
     """An image, the defocus layers of its pixels, and the PSF of each layer. See :func:`layered_scene`.
 
     Backends sort pixels by their layers: gather those of the output (B or 1, h, w), scatter and occlusion those of
-    :attr:`plane`. What lies beyond a border of zeros has no weight there, and takes the layers of the nearest pixels.
+    :attr:`plane`. Pixels beyond a border of zeros have no weight there, and take the layers of the nearest pixels.
 
     Args:
         image: (B, C, H, W) linear light in float32 or float64.
@@ -69,7 +69,7 @@ class LayeredScene:
         layer_weight: (B or 1, 1, H, W) weight of the next layer, or None for nearest layers.
         psfs: (D, C, P, P) of the image's dtype, with P odd; with a field (F, D, C, P, P).
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         dtype: of the rendered image.
         sorted_layers: layer index and layer weight of the pixels that are sorted, and
@@ -164,7 +164,7 @@ def layered_scene(
         stray_light: (D, C) fraction of a point's light that is spread evenly, or None for none.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
         layers: ``"linear"`` or ``"nearest"``, see :func:`assign_layers`.
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`.
         correlate: flip the PSFs by 180 degrees.
         field: where over the picture PSFs are known. Default: they are the same everywhere.
 

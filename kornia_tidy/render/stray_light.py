@@ -2,9 +2,10 @@ r"""Stray light in a dark surround: how much of the light outside the PSF's wind
 
 Outside its window a PSF is not known; only the share v of the light out there is, and the renderer spreads it evenly.
 Where the border continues the image, as much of it comes in from beyond as leaves. With the border ``zero`` nothing
-lies beyond: light comes from pixels of the image only, and what lands outside is lost. How far it flies then matters.
-Behind an aperture with sharp edges, those of the mask's pixels included, the light falls as the inverse cube of the
-distance (Airy's pattern does on average), so that what lies beyond a ring of pixels falls as the inverse of its radius.
+lies beyond: light comes from pixels of the image only, and light that lands outside is lost. How far it flies then
+matters. Behind an aperture with sharp edges, those of the mask's pixels included, the light falls as the inverse cube
+of the distance (Airy's pattern does on average), so that the light beyond a ring of pixels falls as the inverse of its
+radius.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
         device: where to put it.
 
     Returns:
-        (height, width) float64, or float32 on a device without it, in [0, 1): how much of a pixel's stray light lands
-        in the image, and as much of its own comes from there. Zero where the window is at least
-        ``2 * max(height, width) - 1`` pixels wide.
+        (height, width) float64, or float32 on a device without it, in [0, 1): share of a pixel's stray light that lands
+        in the image, equal to the share that it receives from there. Zero where the window is at least ``2 *
+        max(height, width) - 1`` pixels wide.
 
     Source: Born and Wolf, Principles of Optics, 8.5.2: encircled energy of a circular aperture.
 
@@ -58,14 +59,14 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
     ring = torch.tensor(edges, dtype=torch.float64, device=device)
     beyond = (radius + 0.5) / (ring + 0.5)  # share of the stray light outside each ring
     density = -beyond.diff() / (2 * ring + 1).square().diff()
-    # Squares of pixels, each with the step by which the density falls at its edge, add up to rings of even density.
+    # Squares of pixels, with the step of the density at the edge of each, add up to rings of even density.
     steps = torch.cat([-density[:1], -density.diff(), density[-1:]])
     down, across = (pixels_around(side, ring) for side in (height, width))
     return (down * steps) @ across.mT
 
 
 def pixels_around(side: int, radius: Tensor) -> Tensor:
-    """Return how many pixels of a line lie at most so far from each of its pixels, (side, K), for K radii.
+    """Return the number of pixels of a line within a radius of each of its pixels, (side, K), for K radii.
 
     Example:
         >>> pixels_around(3, torch.tensor([1.0])).flatten().tolist()
@@ -81,7 +82,7 @@ def spread_evenly(light: Tensor, psf_size: int, border: str) -> Tensor:
     Args:
         light: (..., H, W) light that leaves the PSFs' window, at the pixels that it comes from.
         psf_size: side of the PSF's window in pixels.
-        border: what lies beyond the image, see :mod:`kornia_tidy.render.borders`.
+        border: continuation of the image beyond its edges, see :mod:`kornia_tidy.render.borders`.
 
     Returns:
         (..., 1, 1), or (..., H, W) for the border ``"zero"``.
@@ -114,14 +115,14 @@ def normalised_share(stray_light: Tensor, psfs: Tensor, shape: Sequence[int], bo
 
     .. math:: v' = \frac{v \, \overline{w}}{\overline{h * 1} + v \, \overline{w}}
 
-    That is occlusion, to which black beyond a border of zeros is nothing that could be seen. With every other border it
+    This is for occlusion, which does not see black beyond a border of zeros. With every other border it
     is v itself.
 
     Args:
         stray_light: v, (D, C).
         psfs: h, (D, C, P, P).
         shape: height and width of the image.
-        border: what lies beyond the image.
+        border: continuation of the image beyond its edges.
     """
     if border != "zero":
         return stray_light

@@ -10,10 +10,10 @@ from kornia_tidy.optics.lens.file_surfaces import AIR, FAR, FileLens, FileSurfac
 from kornia_tidy.optics.lens.glasses import catalogue_glass
 
 UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
-_POWERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # of an asphere's coefficients; there is no I
+_POWERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # of an asphere's coefficients; the letter I is left out
 _FIELDS = ("XAN", "YAN", "XIM", "YIM", "XRI", "YRI", "XOB", "YOB")
 _FICTITIOUS = re.compile(r"\d{3,6}\.\d{3,6}")  # digits of nd - 1, and of Abbe's number after two
-# Commands that say how the lens is used, drawn, made or improved, not what it is.
+# Commands about the use, drawing, making or improvement of a lens, not its shape.
 _DISPLACED = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "CUF")  # allowed where they are 0
 _WITHOUT_EFFECT = (
     *("ASP", "CAN", "CCY", "CLS", "CON", "CWL", "DER", "EPD", "FNO", "GO", "INI", "LEN", "LOC", "NA", "NAO"),
@@ -29,21 +29,20 @@ def read_codev(text: str) -> FileLens:
         text: of the file.
 
     Raises:
-        ValueError: if it holds what is no surface of revolution between air and glass, or is damaged.
+        ValueError: if it holds other things than surfaces of revolution between air and glass, or is damaged.
 
     Convention:
-        - The file says by ``RDM`` whether surfaces have radii or curvatures: programs differ in what they take
-          otherwise.
+        - ``RDM`` in the file chooses radii or curvatures of surfaces: the defaults of programs differ.
         - Spheres, conics and aspheres to the 20th power are read. Decentred and tilted surfaces, mirrors, apertures
           that are no discs and commands that are not known are refused by name.
 
-    Source: CODE V Reference Manual (Synopsys), chapters on lens data and materials, for what the commands mean.
+    Source: CODE V Reference Manual (Synopsys), chapters on lens data and materials, for the meaning of the commands.
     """
     return _Reader().read(text)
 
 
 class _Reader:
-    """What has been read of a file so far."""
+    """Contents of a file read so far."""
 
     def __init__(self) -> None:
         self.lens = FileLens()
@@ -83,7 +82,7 @@ class _Reader:
         return lens
 
     def _command(self, name: str, words: Sequence[str]) -> None:
-        command = name.upper()[:3]  # what follows is for people
+        command = name.upper()[:3]  # the rest is for people
         if command in ("PRV", "END"):
             self.private = [] if command == "PRV" else None
         elif self.private is not None:

@@ -18,7 +18,7 @@ def mirrored_nodes(count: int, crowding: float = 0.0) -> Tensor:
 
     Args:
         count: n.
-        crowding: c, by which nodes lie denser at the axis. Lenses with odd powers of the radius need it.
+        crowding: c, the higher density of nodes at the axis. Lenses with odd powers of the radius need it.
 
     Example:
         >>> mirrored_nodes(3).round(decimals=3).tolist(), mirrored_nodes(3, 2.0).round(decimals=3).tolist()
@@ -35,7 +35,7 @@ def height_weights(count: int, heights: Tensor, crowding: float = 0.0, *, odd: b
         count: of nodes.
         heights: (F,) in [0, 1].
         crowding: of the nodes.
-        odd: for functions that change their sign at the axis; else for those that are mirrored there.
+        odd: for functions that change their sign at the axis; otherwise for functions that are mirrored there.
 
     Returns:
         (F, count) float64.

@@ -12,7 +12,7 @@ from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 AIR = "air"
-FAR = 1e9  # in units of the file: objects beyond are at infinity, as 1e10 stands for it
+FAR = 1e9  # in units of the file: objects beyond are at infinity, written as 1e10
 _OUT_OF_FOCUS = 0.03  # focal lengths from the paraxial focus beyond which the file's sensor is not where its focus is
 _ROUNDING = 1e-7
 _VISIBLE = (380e-9, 1000e-9)
@@ -96,7 +96,7 @@ def lens_of(lens: FileLens) -> tuple[Prescription, float | None]:
             raise ValueError(f"the distance behind {row.where} must not be negative, got {row.gap:g}")
     to_sensor = lens.unit * sum(row.gap for row in rows[next(i for i, row in enumerate(rows) if not row.stop) :])
     rows[-1] = replace(rows[-1], gap=0.0)
-    if rows[-1].stop:  # what lies behind it is air
+    if rows[-1].stop:  # air is behind it
         rows.append(FileSurface(rows[-1].where))
     surfaces = [_entry(row, lens.unit) for row in rows]
     given = {"name": lens.name[:200], "unit": "mm", "surfaces": surfaces, "index": lens.indices}

@@ -23,7 +23,7 @@ def catalogue_glass(name: str, makers: Sequence[str] = ()) -> dict[str, Any]:
             name means several glasses.
 
     Raises:
-        ValueError: if there is no such glass.
+        ValueError: if the glass is unknown.
 
     Source: the makers' data sheets, as collected in the public domain (CC0) at refractiveindex.info; plastics:
         Sultanova, Kasarova and Nikolov, Acta Physica Polonica A 116, 585 (2009); silica: Malitson, J. Opt. Soc. Am. 55,
@@ -60,7 +60,7 @@ def _plain(name: str) -> str:
 
 @lru_cache(maxsize=1)
 def _catalogue() -> dict[tuple[str, str], dict[str, Any]]:
-    """Return each glass of the table: s stands for Sellmeier's formula, p for a power series of n^2."""
+    """Return each glass of the table: s for Sellmeier's formula, p for a power series of n^2."""
     table = {}
     for row in files("kornia_tidy.optics.lens").joinpath("glasses.csv").read_text("utf-8").splitlines()[1:]:
         maker, name, formula, *numbers = row.split(",")

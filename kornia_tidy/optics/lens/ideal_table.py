@@ -44,7 +44,7 @@ def ideal_table(
         reach: lowest and highest defocus in radians.
         pupil_radius: in metres.
         image_distance: from the lens to the sensor in metres.
-        distortion: by which images are larger at the largest height, as a part of 1; it goes with the square of it.
+        distortion: relative enlargement of images at the largest height; it grows as the square of the height.
     """
     nodes, _ = np.polynomial.legendre.leggauss(_DEGREE // 2 + 3)
     radius = torch.from_numpy(np.sqrt((nodes + 1) / 2))[:, None]
@@ -108,13 +108,13 @@ def read_zernike_table(
         path: a CSV file with the columns ``field_mm``, ``wavelength_nm`` (may be missing: 530) and ``Z1``, ``Z2``, ...
             in waves of that wavelength, for fields along +y.
         order: ``"noll"``, orthonormal, or ``"fringe"`` (University of Arizona), of unit amplitude at the edge.
-        sign: -1 where positive coefficients stand for a wavefront that is ahead, 1 where its path is longer.
+        sign: -1 if positive coefficients mean a wavefront that is ahead, 1 if they mean a longer path.
 
     Returns:
         The wavefront, wavelengths in metres, and the largest field in metres.
 
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if the file is missing.
         ValueError: if a value is missing or no number.
     """
     check_choice("order", order, ORDERS)

@@ -1,6 +1,6 @@
 r"""Wavefronts of a lens at its stop, by rays that join the stop's points with the object and with the image.
 
-Light that a mask in the stop diffracts leaves it in directions of its own. What arrives at the image point P from the
+Light that a mask in the stop diffracts leaves it in other directions. What arrives at the image point P from the
 stop's point q came along the ray that joins q and P, whatever ray of the object went through q. So
 
 .. math:: W(q) = [O \to q] + [q \to P] - \text{the same of the stop's centre},
@@ -25,7 +25,7 @@ from kornia_tidy.optics.lens.rays import Array, Rays, trace
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 _STEPS, _CLOSE = 40, 1e-11  # of Newton's method; of the aim, in parts of the stop's radius or of the focal length
-_NUDGE = 1e-5  # by which the Jacobian is found
+_NUDGE = 1e-5  # step for the Jacobian
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ def read_json_lens(value: Any) -> FileLens | None:
         value: of the file.
 
     Raises:
-        ValueError: if it holds what is no surface of revolution between air and glass, or is damaged.
+        ValueError: if it holds other things than surfaces of revolution between air and glass, or is damaged.
         TypeError: if a value is of another type.
     """
     if not isinstance(value, Mapping):

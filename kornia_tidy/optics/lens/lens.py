@@ -47,7 +47,7 @@ class Lens(nn.Module):
         f_number: focal length over diameter of the entrance pupil.
         focus_distance: from the entrance pupil to the plane in focus, in metres.
         table: coefficients.
-        residual: largest rms over the stop of what the table leaves of the traced wavefronts, in waves.
+        residual: largest rms over the stop of the table's error against the traced wavefronts, in waves.
 
     Convention:
         - The stop lies in the mask's plane; positions in it are in stop radii. Depth counts from the entrance pupil.
@@ -107,7 +107,7 @@ class Lens(nn.Module):
                 tabulated for.
 
         Raises:
-            ValueError: if there is no such lens, or it cannot be traced so.
+            ValueError: if the lens is unknown, or cannot be traced.
 
         Example:
             >>> lens = Lens.named("triplet-50mm", f_number=8, focus_distance=0.595)
@@ -236,7 +236,7 @@ class Lens(nn.Module):
                 where they are a longer path.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if a value is missing, no number, or out of range.
 
         Example:
@@ -252,7 +252,7 @@ class Lens(nn.Module):
         given = focal_length, f_number, focus_distance, field
         return cls(*ideal_parts("Zernike table", os.path.basename(path), wavefront, waves, *given))
 
-    # ------------------------------------------------------------------ what it does to light
+    # ------------------------------------------------------------------ its effect on light
 
     @property
     def field(self) -> float:
@@ -266,7 +266,7 @@ class Lens(nn.Module):
 
     @property
     def residual(self) -> float:
-        """Largest rms over the stop of what the table leaves of traced wavefronts, in waves; 0 where none were."""
+        """Largest rms over the stop of the table's error against traced wavefronts, in waves; 0 without any."""
         return self._residual
 
     @property
@@ -387,8 +387,8 @@ class Lens(nn.Module):
         """Read a lens written by :meth:`save`.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is no lens, or a value is NaN or infinite.
+            FileNotFoundError: if the file is missing.
+            ValueError: if the file is not a lens, or a value is NaN or infinite.
         """
         return cls(*lens_parts(*read_tensors(path, "lens"), str(path)))
 
@@ -439,7 +439,7 @@ class Lens(nn.Module):
     ) -> None:
         lists = missing_keys, unexpected_keys, error_msgs
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, *lists)
-        if (key := f"{prefix}_extra_state") in missing_keys:  # a state of masks alone leaves the lens as it is
+        if (key := f"{prefix}_extra_state") in missing_keys:  # a state of only masks does not change the lens
             missing_keys.remove(key)
 
     def extra_repr(self) -> str:

@@ -38,7 +38,7 @@ def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: st
         path: for messages.
 
     Raises:
-        ValueError: if the file is no lens, a value is NaN or infinite, or shapes do not fit.
+        ValueError: if the file is not a lens, a value is NaN or infinite, or shapes do not fit.
     """
     names = {*LensTable.__dataclass_fields__, "scalars"}
     if _FORMAT not in notes or set(tensors) != names:

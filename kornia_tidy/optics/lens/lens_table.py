@@ -1,4 +1,4 @@
-"""Lens table: what a lens does to light over field height, defocus and wavelength, in a few thousand numbers."""
+"""Lens table: the effect of a lens on light over field height, defocus and wavelength, in a few thousand numbers."""
 
 from __future__ import annotations
 

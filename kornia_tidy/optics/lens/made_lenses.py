@@ -25,7 +25,7 @@ WIDEST = 20.0  # radians; nearer depths than of this defocus are in a table only
 
 
 class LensParts(NamedTuple):
-    """What a lens is made of; see :class:`~kornia_tidy.optics.lens.lens.Lens`."""
+    """The parts of a lens; see :class:`~kornia_tidy.optics.lens.lens.Lens`."""
 
     name: str
     source: str

@@ -89,7 +89,7 @@ class Prescription:
                 ``"t"`` (distance to the next vertex), ``"glass"`` (behind it, default ``"air"``) and ``"r"`` (clear
                 radius or None); ``"index"``, {glass: index}, where an index is a number, {wavelength in nm: number},
                 {"nd": ..., "vd": ...}, {"sellmeier": [[b, c in um^2], ...]} or {"powers": [[c, p], ...]} for
-                n^2 as a sum of c um^p; and, as far as they are known,
+                n^2 as a sum of c um^p; and, if known,
                 ``"name"``, ``"source"``, ``"image_plane_infinity"`` and ``"unit"`` of all lengths, ``"m"`` or
                 ``"mm"``. Default: metres; millimetres where ``"pitch_um"`` stands, as in tables of reference lenses.
 

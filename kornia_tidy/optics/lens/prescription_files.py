@@ -25,8 +25,8 @@ def read_prescription_file(path: str | os.PathLike[str]) -> tuple[Prescription, 
             keys of :meth:`Prescription.read`.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is of another kind, damaged, or holds what is not read; the path is named.
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is of another kind, damaged, or holds unsupported things; the path is named.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:

@@ -17,19 +17,19 @@ from kornia_tidy.optics.lens.rays import Array
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
 
-DEGREE = 12  # of the polynomials that are fitted; what is not needed of them is left out
+DEGREE = 12  # of the fitted polynomials; unneeded ones are dropped
 DEPTHS = 5
 HEIGHTS = (9, 17, 33)
 _CROWDING = 2.0  # of heights at the axis, for odd powers of the radius
 RESIDUAL = 3e-4  # waves rms that are good enough; rays of wide aspheric lenses need more polynomials than there are
 _DROPPED_PHASE, _DROPPED_MAP, _DROPPED_LIGHT = 1e-4, 2e-6, 2e-4  # waves rms; parts of the pupil's radius; of the light
-_RIM = 0.15  # around 1, of the squared height in clear radii: rays by which a rim's disc is fitted
+_RIM = 0.15  # around 1, of the squared height in clear radii: range of the rays that fit a rim's disc
 _TO_RADIANS = 2 * math.pi / REFERENCE_WAVELENGTH
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A table, and what it leaves of wavefronts that it was not fitted to: largest rms over the stop, in waves."""
+    """A table, and its error against wavefronts outside the fit: largest rms over the stop, in waves."""
 
     table: LensTable
     residual: float
@@ -129,7 +129,7 @@ def _fitted(system: FirstOrder, wavelength: float, heights: Array, psi: Array, p
 
 
 def _area(along: Tensor, across: Tensor, points: Array) -> Tensor:
-    """Return the area that a map makes of an area of the stop, from its coefficients, (..., N)."""
+    """Return the area to which a map takes an area of the stop, from its coefficients, (..., N)."""
     steps, columns = 1e-4 * np.eye(2), []
     for step in steps:
         rise = [
@@ -144,8 +144,8 @@ def _area(along: Tensor, across: Tensor, points: Array) -> Tensor:
 def _edges(traced: Wavefronts, points: Array) -> Tensor:
     """Return the discs that rims leave of the stop at each height, (H, surfaces, 2): centre along the field, radius.
 
-    Near its rim a surface is met at a height r with r^2 = p + q x + s (x^2 + y^2), whose contours are circles:
-    exactly so for paraxial rays. At the middle depth.
+    Near its rim a surface is met at a height r with r^2 = p + q x + s (x^2 + y^2), with circles as contours: exactly
+    for paraxial rays. At the middle depth.
     """
     squares = traced.heights[:, :, traced.heights.shape[2] // 2] ** 2  # (surfaces, H, N)
     x, y = points.T
@@ -167,7 +167,7 @@ def _table(
     reach: tuple[float, float],
     field: tuple[float, float],
 ) -> LensTable:
-    """Return the table of coefficients at heights, without those that are too small to matter."""
+    """Return the table of coefficients at heights, without negligible ones."""
 
     def stacked(name: str) -> Tensor:  # (W, H, S, ...)
         return torch.stack([torch.stack([getattr(part, name) for part in row]) for row in fitted])
@@ -208,7 +208,7 @@ def _table(
 
 
 def _trimmed(values: Tensor, least: float, *, defocus: bool = False, sines: bool = False) -> Tensor:
-    """Return coefficients without the highest degrees and depths whose rms is small everywhere."""
+    """Return coefficients without the highest degrees and depths with a small rms everywhere."""
     if defocus:
         rms = values.square().sum(-1).sqrt().amax((0, 2))
         values = values[:, : max(1, _needed(rms, least))]
@@ -223,7 +223,7 @@ def _trimmed(values: Tensor, least: float, *, defocus: bool = False, sines: bool
 
 
 def _needed(rms: Tensor, least: float) -> int:
-    """Return how many of the entries must stay for what is dropped to be small."""
+    """Return the number of entries to keep so that the dropped ones are small."""
     tails = rms.square().flip(0).cumsum(0).flip(0).sqrt()
     return int((tails > least).sum())
 

@@ -13,7 +13,7 @@ UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "METER": 1000.0, "M": 
 TYPES = ("STANDARD", "EVENASPH", "ODDASPHE")
 MOST_TERMS = 8  # of an asphere
 _ANGLES, _HEIGHTS = ("0",), ("2", "3")  # kinds of field: angles, and heights on the sensor
-# Keywords of a surface that say how it is drawn, coated, made or found by the program, not what it is.
+# Keywords for the drawing, coating, making or solving of a surface, not its shape.
 _WITHOUT_EFFECT = (
     *("BLNK", "COAT", "COFN", "COMM", "EDGE", "FIMP", "HIDE", "MAZH", "MEMA", "MIRR", "OEMA", "PICK", "POPS", "PPAR"),
     *("PUSH", "PZUP", "SLAB", "VCON", "VDSZ", "VPAR"),
@@ -31,7 +31,7 @@ def read_zemax(text: str) -> FileLens:
         text: of the file.
 
     Raises:
-        ValueError: if it holds what is no surface of revolution between air and glass, or is damaged.
+        ValueError: if it holds other things than surfaces of revolution between air and glass, or is damaged.
 
     Convention:
         - Of types of surfaces STANDARD, EVENASPH and ODDASPHE are read. Coordinate breaks, mirrors, apertures that are
@@ -39,7 +39,7 @@ def read_zemax(text: str) -> FileLens:
         - Light is cut at circular and floating apertures, and at diameters that the designer fixed; not at those that
           the program found.
 
-    Source: ZEMAX Optical Design Program User's Guide (2011), chapters 4 to 7, for what the values mean.
+    Source: ZEMAX Optical Design Program User's Guide (2011), chapters 4 to 7, for the meaning of the values.
     """
     header, blocks = _blocks(text)
     lens = FileLens(name=" ".join(header.get("NAME", [[]])[-1]))
@@ -146,7 +146,7 @@ def _surface(i: int, block: Sequence[Sequence[str]], indices: dict[str, Any], ca
 
 
 def _powers(where: str, terms: dict[float, float], step: int) -> dict[int, float]:
-    """Return the powers of an asphere from its parameters, of which each stands for a step of the power."""
+    """Return the powers of an asphere from its parameters, one for each step of the power."""
     for term, value in terms.items():
         if value and term not in range(1, MOST_TERMS + 1):
             raise ValueError(f"PARM of {where} must be from 1 to {MOST_TERMS}, got {term:g}")

@@ -13,7 +13,7 @@ BLOCK_BYTES = 31 << 20  # the largest that glibc learns from is 32 MiB
 def keep_memory() -> None:
     """Let the process keep up to 62 MiB of free memory, from now on.
 
-    Transforms return memory of their own, some MiB for each chunk. glibc gives free memory back to the system above
+    Transforms allocate their results, some MiB for each chunk. glibc gives free memory back to the system above
     twice the largest block so far that it had from there directly, and fetching it again takes up to half as long as
     the transforms themselves. Taking one large block, and letting it go, teaches it. Nothing is written to the block,
     so that it takes no time and no memory. Other C libraries have their own ways, and where the user has set

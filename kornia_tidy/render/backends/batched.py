@@ -29,7 +29,7 @@ from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
 PART_BYTES = 672 << 20  # that the planes of a chunk may take on an accelerator
-_STEP = 16  # samples of which windows on processors are a multiple: transforms of others take up to twice as long
+_STEP = 16  # samples that divide windows on processors: transforms of other sizes take up to twice as long
 _PRODUCT = 6  # operations of a complex product
 # Planes of a pair at a time, for occlusion in each channel: spectra, products, light and quotients.
 _PLANES, _OCCLUSION_PLANES = 3, 6

@@ -1,7 +1,7 @@
 """The compiled backend: gather, scatter and occlusion in C, on processors.
 
 Small PSFs are convolved sample by sample (``direct.c``), larger ones by transforms of overlapping windows
-(``overlap.c``), each block or window with the PSFs of its own layers and with no other. Occlusion is convolved directly
+(``overlap.c``), each block or window with only the PSFs of its layers. Occlusion is convolved directly
 (``occlusion.c``): all that is added up is positive, so float32 is enough, as the relative error of every sum is small,
 however small the normaliser that it becomes. Gradients of its PSFs and stray light are made in the same way, those of
 image and depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kernels.build`.
@@ -33,7 +33,7 @@ NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 # Operations for each sample of a window, as many as take as long: to cut it out and to write its tile, and for each
 # layer to multiply by a spectrum and to add up.
 _TILE, _PAIR = 100, 14
-_WINDOW = 1e5  # for each window beside those of its samples: what small ones take longer
+_WINDOW = 1e5  # for each window beside those of its samples: the extra time of small ones
 _TERMS = 3  # of a PSF over the field: its value and two gradients
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
@@ -64,7 +64,7 @@ class CompiledBackend:
         lowest = float(psfs.min())
         if lowest < 0:
             lowest = float(psfs.clamp(max=0).sum((-2, -1)).min())
-        if lowest < -NEGATIVE:  # sums keep their relative accuracy only where what is added up is positive
+        if lowest < -NEGATIVE:  # sums keep their relative accuracy only where all terms are positive
             return (
                 f"its occlusion needs PSFs without negative values, got one with {lowest:.1e} of its light below zero"
             )

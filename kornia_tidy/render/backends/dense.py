@@ -64,7 +64,7 @@ class DenseBackend:
 
 
 def gather_dense(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, layer_index: Tensor) -> Tensor:
-    """Convolve a plane with each layer's PSF and blend at each pixel those of its own layers: gather.
+    """Convolve a plane with each layer's PSF and blend at each pixel those of its layers: gather.
 
     Args:
         plane: (B, C, H + P - 1, W + P - 1) light.
@@ -117,8 +117,8 @@ def differentiable_gradients(
     Args:
         render: function of the inputs that returns the image.
         inputs: tensors, or None.
-        grad: gradient of what it returns.
-        wanted: of which inputs.
+        grad: gradient of the result.
+        wanted: inputs that need a gradient.
 
     Example:
         >>> x = torch.tensor(3.0, requires_grad=True)
@@ -140,7 +140,7 @@ def dense_work(scene: LayeredScene, layers: int, at_once: int) -> Work:
     Args:
         scene: to be rendered.
         layers: that are convolved.
-        at_once: layers whose planes are in memory together.
+        at_once: layers with planes in memory at the same time.
     """
     (batch, channels), (height, width) = scene.image.shape[:2], scene.padded_size
     occludes, itemsize = scene.compositing == "occlusion", scene.image.element_size()

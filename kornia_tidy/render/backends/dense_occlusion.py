@@ -1,7 +1,7 @@
 r"""Occlusion in plain operations of torch: blurred, normalised layers are composited from near to far.
 
-A plain sum over layers is wrong at the outline of a near object: gather does not let its blur reach over what lies
-behind, scatter darkens or brightens the seam. Here layers of blurred opacity are laid over one another.
+A plain sum over layers is wrong at the outline of a near object: gather does not let its blur reach over the
+background, scatter darkens or brightens the seam. Here layers of blurred opacity are laid over one another.
 
 A pixel takes light from a layer through a quotient, and where it sees little of a layer the divisor is small: the
 round-off of a transform in float32, some 1e-7, would be divided by as little as ``EPSILON``. So layers are blurred in

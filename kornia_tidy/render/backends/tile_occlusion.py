@@ -25,7 +25,7 @@ from kornia_tidy.render.layers import weight_of_layer
 
 
 class _Inputs(NamedTuple):
-    """What a chunk is rendered from and has gradients for. Each tensor of a pair is that of its layer."""
+    """Inputs of a chunk, and those with gradients. Each tensor of a pair is that of its layer."""
 
     light: Tensor  # (b, C, h, w) part of the plane
     spectra: Tensor  # (K, C, height, width) of the PSFs

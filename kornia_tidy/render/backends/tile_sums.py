@@ -124,7 +124,7 @@ class TileSums:
         (_, rows, columns), (images, top, left) = chunk.extent, chunk.pixels
         (height, width), (down, across) = self.grid.size, self.grid.tile
         tiles = torch.view_as_real(light).unflatten(0, chunk.extent).movedim(3, 1)  # (b, c, rows, columns, h, w, 2)
-        # In pieces of which no pixel is met twice in one addition.
+        # In pieces that meet no pixel twice in one addition.
         step = down if rows > 1 else height, 2 * across if columns > 1 else width
         for half, i, j in product(range(2), range(0, height, step[0]), range(0, width, step[1])):
             piece = tiles[..., i : i + step[0], j : j + step[1], half]

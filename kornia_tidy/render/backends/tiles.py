@@ -204,7 +204,7 @@ def _runs(layers: list[int], counts: list[int]) -> Iterator[tuple[slice, slice, 
 
 
 def part_of(planes: Tensor, chunk: Chunk, grid: Grid) -> Tensor:
-    """Return what a chunk's windows see of (B, ..., H', W') planes, with zeros beyond their ends.
+    """Return the windows of a chunk in (B, ..., H', W') planes, with zeros beyond their ends.
 
     Args:
         planes: windows of the first tile start at their first pixel.
