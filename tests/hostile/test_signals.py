@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from kornia_tidy import cli
+from kornia_tidy.cli import command_line
 from kornia_tidy.files import replacing
 from kornia_tidy.signals import is_command
 from tests.base import BaseTester
@@ -53,7 +53,7 @@ def send_after(number, seconds):
 
 def run_instead(monkeypatch, action):
     """Let the command do something else."""
-    monkeypatch.setattr(cli, "read_command", lambda _: SimpleNamespace(run=lambda: action(None)))
+    monkeypatch.setattr(command_line, "read_command", lambda _: SimpleNamespace(run=lambda: action(None)))
 
 
 def whole_run(argv, folder):
@@ -123,7 +123,7 @@ class TestSignals(BaseTester):
 
         def command():
             signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
-            os._exit(cli.main([]))
+            os._exit(command_line.main([]))
 
         run_instead(monkeypatch, write)
         assert wait(fork(command)) == STATUS[number]
@@ -148,7 +148,7 @@ class TestSignals(BaseTester):
         run_instead(monkeypatch, load)
         before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
         try:
-            assert cli.main([]) == STATUS[number]
+            assert command_line.main([]) == STATUS[number]
         finally:
             signal.signal(signal.SIGINT, before)
             sys.modules.pop("takes_all", None)
@@ -162,11 +162,11 @@ class TestSignals(BaseTester):
 
         before = signal.signal(signal.SIGTERM, mine)
         try:
-            assert cli.main([]) == 0
+            assert command_line.main([]) == 0
             assert signal.getsignal(signal.SIGTERM) is mine
         finally:
             signal.signal(signal.SIGTERM, before)
-        assert cli.main([]) == 0
+        assert command_line.main([]) == 0
         assert signal.getsignal(signal.SIGTERM) is before
 
 
