@@ -61,9 +61,10 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     """
     radius, border = bank.window // 2, rendering.border
     check_border(border, *light.shape[-2:], bank.window)
-    if _is_compiled(light, bank, rendering):
-        given = light, defocus, bank.defocus, bank.psfs, None
-        seen = render_layers(*given, **asdict(rendering), field=field)
+    alike = field.nodes == (1, 1) and rendering.compositing != "occlusion"
+    if alike or _is_compiled(light, bank, rendering):
+        given = light, defocus, bank.defocus, bank.psfs[0] if alike else bank.psfs, None
+        seen = render_layers(*given, **asdict(rendering), field=None if alike else field)
         return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
     plane, deep, inside, around = light, defocus, None, field
     if border != "valid":

@@ -11,6 +11,7 @@ from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render import over_field
 from kornia_tidy.render.borders import BORDERS
+from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, Rendering, explain, render_layers
 from kornia_tidy.render.over_field import render_over_field
 from kornia_tidy.render.scene import layered_scene
@@ -132,6 +133,13 @@ class TestRenderOverField(BaseTester):
         told = str(explain(layered_scene(*given, field=field)))
         assert "3 of 3 layers, PSFs of 9x9 px at 3x2 places over the picture: compiled" in told
         assert "batched: PSFs that vary over the picture are rendered cell by cell" in told
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    def test_feature_one_node_costs_what_the_axis_does(self, compositing):
+        (light, defocus), field = scene_of(), Field(SIZE, (1, 1))
+        bank, rendering = bank_over(field), Rendering(compositing, "reflect")
+        own = render_over_field(light, defocus, bank, field, rendering)
+        assert torch.equal(own, render(light, defocus, bank.at(0), compositing))
 
     def test_exception_backends_of_one_psf(self):
         field = Field(SIZE, (2, 2))
