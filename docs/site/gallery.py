@@ -30,6 +30,7 @@ TITLES = {
     "learn_with_switching": "Masks for a slow modulator",
     "time_average_or_burst": "One exposure or a burst",
     "motion_blur": "The direction of motion",
+    "four_lenses": "One scene behind four lenses",
 }
 # Smaller than the defaults where these take minutes: each page shows the command that made it.
 ARGUMENTS = {
