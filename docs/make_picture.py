@@ -1,4 +1,4 @@
-"""Draw the picture at the top of the README, docs/images/camera.png, with the library itself on a scene made here.
+"""Draw the picture at the top of the README, docs/images/camera.png, with the library itself on a sample scene.
 
     python docs/make_picture.py
 
@@ -23,7 +23,7 @@ from matplotlib.patches import FancyArrowPatch, Rectangle
 from PIL import Image
 from torch import Tensor
 
-from kornia_tidy.data import dead_leaves
+from kornia_tidy.data import sample_scene
 from kornia_tidy.figures.explained import single_mask_banks
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.reconstruction.pretrained import load_pretrained
@@ -45,15 +45,15 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     """Draw the picture and return where it was written."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", type=int, default=256, help="side of the scene in pixels (default: 256)")
-    parser.add_argument("--seed", type=int, default=12, help="of scene and noise (default: 12)")
+    parser.add_argument("--seed", type=int, default=12, help="of the noise (default: 12)")
     parser.add_argument("--output", type=Path, default=PICTURE, help="picture to write (default: %(default)s)")
     options = parser.parse_args(arguments)
 
     system = load_pretrained("joint-uncertain")
     camera = system.optics.camera
-    image, depth = dead_leaves(
-        options.size, options.size, depth_range=camera.depth_range, num_leaves=300, seed=options.seed
-    )
+    scene = sample_scene(height=options.size)
+    margin = (scene.image.shape[-1] - options.size) // 2
+    image, depth = (part[..., margin : margin + options.size] for part in (scene.image, scene.depth))
     capture = system.optics(image, depth, generator=torch.Generator().manual_seed(options.seed))
     estimate = {name: found[0] for name, found in split_maps("joint", system.head(capture[None])).items()}
     lo, hi = camera.defocus_range
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     _picture(figure, SCENE_X, LOWER, _depth_colors(truth), "and its depth", "near is bright")
     _psfs(figure, system)
     _picture(figure, CAPTURE_X, (UPPER + LOWER) / 2, capture, "The coded capture", "one exposure, five masks")
-    _picture(figure, ESTIMATE_X, UPPER, estimate["image"], "A network reads from it", "the scene, sharp at all depths")
+    _picture(figure, ESTIMATE_X, UPPER, estimate["image"], "Restored by the network", "sharp at all depths")
     _picture(figure, ESTIMATE_X, LOWER, _depth_colors(estimate["depth"]), "and its depth")
     middle = (UPPER + LOWER + SIDE) / 2
     _arrow(figure, (SCENE_X + SIDE + 0.07, middle), (MASKS_X - 0.15, middle))
