@@ -26,8 +26,7 @@ def distorted(optics: TiDyOptics, image: Tensor, depth: Tensor, field_center: An
 
     Args:
         optics: the camera with its lens.
-        image: (B, C, H, W) or (C, H, W), as a pinhole at the entrance pupil sees the scene; in linear light, or encoded
-            as it is to be interpolated.
+        image: (B, C, H, W) or (C, H, W), as a pinhole at the entrance pupil sees the scene.
         depth: (B, 1, H, W) or (1, H, W) in metres.
         field_center: where the middle of the picture lies from the axis, (2,) or (B, 2), y and x in sensor pixels.
             Default: the camera's.
@@ -35,7 +34,7 @@ def distorted(optics: TiDyOptics, image: Tensor, depth: Tensor, field_center: An
     Returns:
         Image and depth of the same shapes, for ``optics(image, depth)``: captures are then aligned with both. Images
         are interpolated bilinearly, so that gradients reach them; depths are those of the nearest pixel, at 530 nm.
-        What comes from beyond the picture repeats its border.
+        Beyond the picture its border is repeated.
 
     Raises:
         TypeError: if image or depth are not floating-point tensors.
