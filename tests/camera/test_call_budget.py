@@ -22,7 +22,7 @@ PACKAGE = Path(kornia_tidy.__file__).parent
 LIMITS = {
     "flat": (49, 17, 8),
     "leaves": (49, 17, 8),
-    "gradient": (93, 28, 11),
+    "gradient": (92, 28, 11),
     "new scene": (81, 25, 12),
     "wide lens": (72, 24, 12),
 }
