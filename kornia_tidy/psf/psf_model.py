@@ -246,7 +246,7 @@ class PSFModel:
             ValueError: if field points are given without a lens, or are not one or more finite points.
         """
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
-        dtype = self.bank_dtype(dtype)
+        dtype = dtype or (torch.float64 if self.fidelity.double else torch.float32)
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
             nodes = self.defocus_nodes if defocus is None else tuple(defocus)
@@ -273,10 +273,6 @@ class PSFModel:
         lens, pupil = cast("Lens", self.lens), self.pupil
         sensor = lens, self.camera.pixel_pitch, window, tolerance
         return field_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, field, *sensor)
-
-    def bank_dtype(self, dtype: torch.dtype | None) -> torch.dtype:
-        """Return the type that was asked for, or float32 or float64 as the fidelity says."""
-        return (torch.float64 if self.fidelity.double else torch.float32) if dtype is None else dtype
 
     def scene_bank(
         self,
@@ -685,7 +681,8 @@ class PSFModel:
 
     def _fitted_window(self) -> FittedWindow:
         if self.measured is not None:
-            return FittedWindow.of_bank(self.measured)
+            energy = self.measured.energy
+            return FittedWindow(self.measured.window, (float(energy.min()), float(energy.max())))
         if (blur := self.wide_blur) is not None:
             return FittedWindow(blur.window, self._wide_light())
         self._check_layers()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.psf.psf_bank import PSFBank, enclosing_window
+from kornia_tidy.psf.psf_bank import enclosing_window
 
 
 class FittedWindow(NamedTuple):
@@ -24,11 +24,6 @@ class FittedWindow(NamedTuple):
     side: int
     held: tuple[float, float]
     enough: bool = True
-
-    @classmethod
-    def of_bank(cls, bank: PSFBank) -> FittedWindow:
-        """Return the window of measured PSFs."""
-        return cls(bank.window, (float(bank.energy.min()), float(bank.energy.max())))
 
     def warn_if_small(self, fidelity: Fidelity, stacklevel: int) -> None:
         """Warn where the largest window allowed does not hold the light that the fidelity asks for."""

@@ -118,12 +118,10 @@ def _layers(planes: OcclusionPlanes, images: slice) -> _Layers:
         alpha = alpha * planes.inside
     light = planes.light[images, None].to(dtype)
     if planes.mean is not None and planes.stray_light is not None:  # both or none
-        light = torch.lerp(light, planes.mean[images, None, :, None, None].to(dtype), _last(planes.stray_light, dtype))
+        light = torch.lerp(
+            light, planes.mean[images, None, :, None, None].to(dtype), planes.stray_light[..., None, None].to(dtype)
+        )
     return _Layers(alpha[:, :, :1] * light, alpha)
-
-
-def _last(stray_light: Tensor, dtype: torch.dtype) -> Tensor:
-    return stray_light[..., None, None].to(dtype)
 
 
 def _blurred(light: Tensor, alphas: Tensor, psfs: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
