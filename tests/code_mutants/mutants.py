@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-PACKAGES = ("psf", "render", "kernels", "camera", "sensor", "planning", "runtime")
+PACKAGES = ("psf", "render", "kernels", "camera", "sensor", "accuracy")
 KINDS = ("sign", "off-by-one", "unit", "gradient", "memory", "condition")
 
 
