@@ -1,4 +1,4 @@
-r"""Rendering through PSFs that vary over the picture, cell by cell and without seams.
+r"""Rendering through PSFs that vary over the picture, without seams: in tiles of the compiled backend, or in cells.
 
 The PSF of a pixel is interpolated between nodes over the field (:class:`kornia_tidy.psf.field.Field`). Within a cell it
 is taken to first order about the cell's middle:
