@@ -72,6 +72,7 @@ def measure(folder: Path) -> None:
                 image = head(linear_rgb_to_rgb(capture.clamp(min=0)), noise=noise).clamp(0, 1)  # noqa: B023
                 error = (image - linear_rgb_to_rgb((gain * truth).clamp(0, 1))).square()  # noqa: B023
                 where = torch.ones_like(error) if mask is None else mask.expand_as(error).float()
+                # NaN where the whole scene is clipped
                 return float(-10 * ((error * where).sum() / where.sum()).log10())
 
             row[name] = {
@@ -92,5 +93,6 @@ def measure(folder: Path) -> None:
     for name in heads:
         for key in rows[0][name]:  # ty: ignore[not-iterable]
             each = torch.tensor([row[name][key] for row in rows])  # ty: ignore[not-subscriptable]
-            first = torch.tensor([row[name]["undisturbed"] for row in rows])  # ty: ignore[not-subscriptable]
-            print(f"{name}, {key}: {float(each.mean()):.2f} dB, {float((each - first).mean()):+.2f}")
+            beside = "four times overexposed, unclipped" if "overexposed" in key else "undisturbed"
+            lost = each - torch.tensor([row[name][beside] for row in rows])  # ty: ignore[not-subscriptable]
+            print(f"{name}, {key}: {float(each.nanmean()):.2f} dB, {float(lost.nanmean()):+.2f}")
