@@ -19,10 +19,10 @@ from kornia_tidy.reconstruction.state_file import read_state
 WEIGHTS = Path(__file__).parent / "pretrained" / "any-camera.safetensors"
 
 SHARE = 1.0  # logit of the share before training
-# Expected error of the closed form from which on the whole share counts, and the exponent below. By the truth the share
-# that is best for a capture is .15, .42, .5 and .65 at an error of .009, .018, .02 and .03 (three scenes of half A
-# behind five cameras).
-FULL_ERROR, EXPONENT = 0.027, 1.3
+# The factor of the share is 1 at an expected error of FULL_ERROR. By the truth the best factor is .1 to .4 at an error
+# of .009, .3 to .6 at .018, .1 to 1.4 at .03, 1 to 1.3 at .045 and 1.4 to 2.8 at .05 (three scenes of half A behind 13
+# cameras of training and validation).
+FULL_ERROR, EXPONENT, MOST = 0.036, 1.7, 1.25
 
 
 class AnyCameraHead(ClosedFormHead):
@@ -81,9 +81,9 @@ class AnyCameraHead(ClosedFormHead):
         return corrected(restored.image, maps, self.largest_share(capture, noise))
 
     def largest_share(self, capture: Tensor, noise: Tensor) -> Tensor:
-        """Return the largest share q of a correction that counts, (B, 1, 1, 1). See the class."""
+        """Return the factor q of the share of a correction, (B, 1, 1, 1). See the class."""
         error = self.closed_form.expected_error(capture, noise)
-        return (error / FULL_ERROR).clamp(max=1) ** EXPONENT
+        return ((error / FULL_ERROR) ** EXPONENT).clamp(max=MOST)
 
 
 @cache
@@ -110,7 +110,7 @@ def corrected(image: Tensor, maps: Tensor, largest: Tensor | float = 1.0) -> Ten
     Args:
         image: (B, 3, H, W).
         maps: (B, 4, H, W).
-        largest: share for an infinite logit.
+        largest: factor of the share.
 
     Example:
         >>> corrected(torch.zeros(1, 3, 1, 1), torch.tensor([0.0, 0.2, 0.4, 0.6]).view(1, 4, 1, 1)).flatten()
