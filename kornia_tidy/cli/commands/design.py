@@ -128,14 +128,7 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.data.rgbd_folder import scenes_in
         from kornia_tidy.design.co_design import Effort, expected_in_words, planned_work
-        from kornia_tidy.design.design_report import (
-            CAMERA,
-            DATA,
-            PICTURE,
-            REPORT,
-            exposure_in_words,
-            focus_distance,
-        )
+        from kornia_tidy.design.design_report import CAMERA, DATA, PICTURE, REPORT, exposure_in_words, focus_distance
         from kornia_tidy.figures.style import require_matplotlib
         from kornia_tidy.files import only_here
 

@@ -76,7 +76,7 @@ Closed forms: {", ".join(CLOSED_FORMS)}.
         """Evaluate the system, write results and pictures, and print a summary."""
         folder = check_folder(self.output or Path(self.system).parent / "evaluation")
         from kornia_tidy.cli.commands.report import progress_bar, tell
-        from kornia_tidy.cli.commands.system_options import load_system
+        from kornia_tidy.lab.named_system import load_system
         from kornia_tidy.reconstruction.tasks import MAPS
         from kornia_tidy.training.data_sets import make_scenes
         from kornia_tidy.training.evaluation import SceneResult, draw_scene, evaluate, metric_range, table, write_table

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from kornia_tidy.lab.mask_export.mask_files import SavedMasks
-    from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
     from kornia_tidy.optics.materials import Material
 
 MasksFile = Annotated[str, Argument("MASKS")]
@@ -201,7 +200,7 @@ class ExportMasks:
         uneven = "" if scale == round(scale) else ", so that blocks differ by one"
         tell("panel", f"{width} x {height} px, {scale:.6g} a mask pixel{uneven}")
         tell("pupil", f"radius {placement.radius(size) * 1e3:.4g} mm on the panel")
-        tell("frames", _frames_in_words(frames))
+        tell("frames", frames.in_words())
         # By the panel's phases and the masks themselves, not by the sidecar's description.
         wanted = heights * metres_to_radians(saved.material, asked.wavelength)
         error, share = read_slm_frames(self.output).phase_error(wanted, levels.levels)
@@ -255,7 +254,7 @@ class ImportMasks:
         frames = read_slm_frames(self.frames)
         heights = frames.heights_shown() if self.shown else frames.heights()
         tell("masks", _in_words(heights))
-        tell("frames", _frames_in_words(frames))
+        tell("frames", frames.in_words())
         if self.output is not None:
             write_heights(self.output, heights, _material(self.material))
             tell("wrote", self.output)
@@ -311,13 +310,3 @@ def _in_words(heights: Tensor) -> str:
     count, rows, columns = heights.shape
     low, high = heights.aminmax()
     return f"{count} of {rows}x{columns} pixels, heights {float(low) * 1e9:.1f} to {float(high) * 1e9:.1f} nm"
-
-
-def _frames_in_words(frames: SLMFrames) -> str:
-    phases = frames.level_phases
-    beyond = float((frames.turns != 0).double().mean())
-    wrapped = f", {beyond:.1%} of the pixels wrapped by whole waves" if beyond else ""
-    return (
-        f"{len(frames.grey)} of {frames.bits} bits, {float(phases.min()):.3f} to {float(phases.max()):.3f} rad at "
-        f"{frames.wavelength * 1e9:g} nm{wrapped}"
-    )

@@ -127,10 +127,10 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         import torch
 
         from kornia_tidy.cli.commands.report import tell
-        from kornia_tidy.cli.commands.system_options import load_system
         from kornia_tidy.figures.reconstruction_files import reconstruct_files
         from kornia_tidy.lab.file_jobs import table
         from kornia_tidy.lab.measured import check_capture, takes_psfs
+        from kornia_tidy.lab.named_system import load_system
         from kornia_tidy.reconstruction.head import takes_noise
         from kornia_tidy.reconstruction.light_head import LightHead
 
@@ -167,8 +167,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             memory_budget=self.memory << 20,
             overlap=self.overlap,
         )
-        name = self.head or self.psfs
-        tell("network", f"{name}: {system.settings.task}, {system.settings.head!r}, {system.step} steps")
+        kind = system.settings
+        tell("network", f"{self.head or self.psfs}: {kind.task}, {kind.head!r}, {system.step} steps")
         failed = sum(row.result not in {"done", "kept"} for row in rows)
         for line in table(rows):
             print(line)
@@ -196,7 +196,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
 
     def _made_by(self) -> dict[str, Any]:
         """Return what results depend on beside their file, to recognise them on resuming."""
-        from kornia_tidy.cli.commands.system_options import digests
+        from kornia_tidy.lab.named_system import digests
 
         return {
             "system": digests(self.head, self.psfs, self.noise),

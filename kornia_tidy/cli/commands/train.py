@@ -161,7 +161,7 @@ Defaults of --learn network, which are for a CPU:
         masks_from = self.masks_from
         if self.design_from is not None and masks_from is None and settings.masks:
             masks_from = designed_camera(self.design_from)
-        say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else _nothing  # only one process prints
+        say = tell if os.environ.get("LOCAL_RANK", "0") == "0" else lambda *_: None  # only one process prints
         many = {"strategy": "ddp"} if machine.devices > 1 else {}
         say("task", f"{settings.task}, {settings.masks} masks, head {settings.head!r}, data {settings.data!r}")
         say("learn", LEARN[settings.learn])
@@ -219,7 +219,3 @@ def _draw_curve(folder: Path) -> list[str]:
         return []
     figure.savefig(folder / CURVE, dpi=150)
     return [CURVE]
-
-
-def _nothing(*_: str) -> None:
-    """Ignore a report line."""

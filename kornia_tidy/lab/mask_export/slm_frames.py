@@ -89,6 +89,15 @@ class SLMFrames:
         """Grey level nearest to phase 0, for panel pixels outside the mask."""
         return int(nearest_level(torch.zeros(1, dtype=torch.float64), self.level_phases))
 
+    def in_words(self) -> str:
+        """Return number, bits and phases of the frames, and how much of them is wrapped."""
+        beyond = float((self.turns != 0).double().mean())
+        wrapped = f", {beyond:.1%} of the pixels wrapped by whole waves" if beyond else ""
+        return (
+            f"{len(self.grey)} of {self.bits} bits, {float(self.level_phases.min()):.3f} to "
+            f"{float(self.level_phases.max()):.3f} rad at {self.wavelength * 1e9:g} nm{wrapped}"
+        )
+
     def heights(self) -> Tensor:
         """Return the heights of the masks in metres, (K, rows, columns) float64, accurate to :meth:`largest_error`."""
         return (self.level_phases[self.grey] + _WAVE * self.turns.double()) / self.radians_per_metre

@@ -1,19 +1,19 @@
-"""The system that restores captures, where a command takes one: shipped, trained, or in closed form."""
+"""The system that restores captures, by its name or file: shipped, trained, in closed form, or for any camera."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.files import read_bytes
+from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+from kornia_tidy.lab.measured import closed_form_system, with_measurements
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.pretrained import FOLDER, check_shipped
-
-if TYPE_CHECKING:
-    from kornia_tidy.reconstruction.trained import TrainedSystem
-    from kornia_tidy.sensor.sensor import SensorNoise
+from kornia_tidy.reconstruction.trained import TrainedSystem, saved_system
+from kornia_tidy.sensor.sensor import SensorNoise
 
 
 def head_file(head: str) -> Path:
@@ -50,10 +50,6 @@ def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) 
         ValueError: if neither a system nor PSFs are given, a file is of another kind, or the PSFs are not of the
             system's lens and depths.
     """
-    from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
-    from kornia_tidy.lab.measured import closed_form_system, with_measurements
-    from kornia_tidy.reconstruction.trained import saved_system
-
     if head is None and psfs is None:
         raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, a saved camera, or --psfs")
     measured = None if psfs is None else MeasuredPSFs.load(psfs)
