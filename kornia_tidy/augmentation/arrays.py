@@ -21,10 +21,11 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
+from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.reconstruction.trained import TrainedSystem, any_camera_system, saved_system
+from kornia_tidy.reconstruction.trained import TrainedSystem
 
 Color = Literal["bgr", "rgb"]
 IMAGES = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))

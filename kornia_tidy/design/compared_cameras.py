@@ -18,12 +18,12 @@ from kornia_tidy.design.simulated_captures import DECISION
 from kornia_tidy.masks.families import random_masks
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_settings
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import depth_logits, split_maps
-from kornia_tidy.reconstruction.trained import any_camera_system
 from kornia_tidy.reconstruction.wiener import Wiener
 from kornia_tidy.sensor.exposure import exposed_sensor
 from kornia_tidy.sensor.sensor import SensorNoise

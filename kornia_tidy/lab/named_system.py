@@ -10,9 +10,10 @@ from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.files import read_bytes
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.measured import closed_form_system, with_measurements
+from kornia_tidy.reconstruction.camera_system import saved_system
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.pretrained import FOLDER, check_shipped
-from kornia_tidy.reconstruction.trained import TrainedSystem, saved_system
+from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.sensor.sensor import SensorNoise
 
 

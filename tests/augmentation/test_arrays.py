@@ -13,9 +13,9 @@ import kornia_tidy
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
 from kornia_tidy.data import from_opencv, read_rgbd, to_opencv
+from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import load_pretrained
-from kornia_tidy.reconstruction.trained import any_camera_system
 from tests.base import BaseTester
 
 MOST = {"uint8": 255, "uint16": 65535, "float32": 1}

@@ -11,6 +11,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from kornia_tidy import SensorNoise
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data import photographic_leaves
+from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import (
     JPEG,
     MeasuredNoise,
@@ -20,7 +21,6 @@ from kornia_tidy.reconstruction.capture_checks import (
     repair_outliers,
 )
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
-from kornia_tidy.reconstruction.trained import any_camera_system
 from tests.base import BaseTester
 
 

@@ -14,11 +14,11 @@ from torch import Tensor
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.files import write_bytes
 from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED
 from kornia_tidy.reconstruction.tasks import metres
-from kornia_tidy.reconstruction.trained import any_camera_system
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera
 from tests.benchmarks.any_camera.scores import READ_ELECTRONS, scored_scenes
