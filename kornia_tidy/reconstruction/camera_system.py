@@ -51,7 +51,8 @@ def saved_system(path: str | os.PathLike[str], sensor: SensorNoise | None = None
     """Load what restores captures from a file: a trained system, or a camera, with the network for any camera.
 
     Args:
-        path: checkpoint of ``kornia-tidy train``, or a camera's state, as :func:`~kornia_tidy.reconstruction.trained.load_camera` reads it.
+        path: checkpoint of ``kornia-tidy train``, or a camera's state, as
+            :func:`~kornia_tidy.reconstruction.trained.load_camera` reads it.
         sensor: of a camera, in place of its own.
 
     Raises:
