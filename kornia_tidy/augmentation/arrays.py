@@ -115,8 +115,10 @@ def reconstruct(
 
     Args:
         capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
-        system: the trained system: a name of :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or an argument
-            or result of :func:`~kornia_tidy.reconstruction.hub.from_pretrained`. For many calls with a system of your
+        system: the camera or the trained system of the captures. The network for any camera restores those of a
+            :class:`~kornia_tidy.TiDyOptics`, or of the file of one. A system is a name of
+            :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or an argument or result of
+            :func:`~kornia_tidy.reconstruction.hub.from_pretrained`. For many calls with a system of your
             own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.
         color: order of the three channels of capture and image.
         linear: True if captures hold linear light, False if they are encoded as sRGB.
