@@ -150,7 +150,8 @@ def reconstruct_files(
     folder.mkdir(parents=True, exist_ok=True)
     if resume:
         remove_leftovers(folder)
-    reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
+    if head.field is None:
+        reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
 
     def work(path: str, progress: Callable[[int, int], None]) -> Row:
         start, paths = time.perf_counter(), outputs[path]

@@ -129,20 +129,19 @@ def takes_psfs(head: nn.Module) -> bool:
 
 
 def check_capture(system: TrainedSystem, path: str, capture: CaptureLight) -> None:
-    """Check that a capture is of the camera whose PSFs were measured.
+    """Check that a capture has the colours of measured PSFs, and the noise that a closed form needs.
 
     Args:
-        system: with measured PSFs, see :func:`closed_form_system` and :func:`with_measurements`.
+        system: of a camera that was measured, see :func:`closed_form_system` and :func:`with_measurements`, or given
+            by lens and masks.
         path: of the capture, for the error.
         capture: as it was read.
 
     Raises:
         ValueError: if it has other colours than the PSFs, or a closed form lacks its noise.
     """
-    measured = system.optics.psf_model.measured
-    assert measured is not None
-    colors, channels = len(capture.light), measured.psfs.shape[1]
-    if colors != channels:
+    measured, colors = system.optics.psf_model.measured, len(capture.light)
+    if measured is not None and colors != (channels := measured.psfs.shape[1]):
         raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
     if capture.noise is None and not system.step:
         raise ValueError(f"the noise of {path} is not known: give --noise")

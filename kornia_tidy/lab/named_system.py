@@ -6,11 +6,12 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.choices import PRETRAINED, REPLACED
 from kornia_tidy.files import read_bytes
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.measured import closed_form_system, with_measurements
-from kornia_tidy.reconstruction.camera_system import saved_system
+from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.pretrained import FOLDER, check_shipped
 from kornia_tidy.reconstruction.trained import TrainedSystem
@@ -37,22 +38,27 @@ def head_file(head: str) -> Path:
     return Path(head)
 
 
-def load_system(head: str | None, psfs: str | None, sensor: SensorNoise | None) -> TrainedSystem:
-    """Return the system that is named, behind the camera that was measured.
+def load_system(
+    head: str | None, psfs: str | None, sensor: SensorNoise | None, optics: TiDyOptics | None = None
+) -> TrainedSystem:
+    """Return the system that is named, behind the camera that was measured or is given.
 
     Args:
         head: name of a shipped system or of a closed form, a checkpoint, or the file of a camera, whose captures the
-            network for any camera restores. None: that network, by measured PSFs.
+            network for any camera restores. None: that network, by the PSFs of the camera.
         psfs: file of measured PSFs.
         sensor: measured noise. None: the system's own.
+        optics: a camera, whose captures a closed form or the network for any camera restores, instead of ``psfs``.
 
     Raises:
         FileNotFoundError: if the file is missing.
         ValueError: if neither a system nor PSFs are given, a file is of another kind, or the PSFs are not of the
             system's lens and depths.
     """
-    if head is None and psfs is None:
+    if head is None and psfs is None and optics is None:
         raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, a saved camera, or --psfs")
+    if optics is not None:
+        return any_camera_system(optics, sensor, head or ANY_CAMERA)
     measured = None if psfs is None else MeasuredPSFs.load(psfs)
     if measured is not None and (head is None or head in CLOSED_FORMS):
         return closed_form_system(measured, sensor, head or ANY_CAMERA)

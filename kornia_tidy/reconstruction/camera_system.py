@@ -1,4 +1,4 @@
-"""A camera with the network that restores the captures of any camera, which is not trained with it."""
+"""A camera with what restores its captures without training: the network for any camera, or a closed form."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import os
 import torch
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_choice
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
-from kornia_tidy.reconstruction.head_names import ANY_CAMERA
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import WHAT
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, load_camera, load_trained, update_psfs
@@ -17,34 +18,36 @@ from kornia_tidy.tensor_files import read_tensors
 
 
 @torch.no_grad()
-def any_camera_system(optics: TiDyOptics, sensor: SensorNoise | None = None) -> TrainedSystem:
-    """Return a camera with the network that restores the captures of any camera; nothing is trained.
+def any_camera_system(optics: TiDyOptics, sensor: SensorNoise | None = None, head: str = ANY_CAMERA) -> TrainedSystem:
+    """Return a camera with the network for any camera, or a closed form; nothing is trained.
 
     Args:
         optics: the camera, of any masks, lens and sensor; it is not changed. Behind a real lens the PSFs are those of
             the field's centre, and :func:`~kornia_tidy.reconstruction.light_head.reconstruct_light` takes those of each
             place.
         sensor: by whose noise captures are restored. Default: the camera's.
+        head: one of :data:`~kornia_tidy.reconstruction.head_names.CLOSED_FORMS`, which has the network.
 
     Returns:
-        The system, for captures encoded as sRGB. Its settings tell of the network alone.
+        The system, for captures encoded as sRGB. Its settings tell of the head only.
 
     Raises:
-        ValueError: if neither is a sensor there.
+        ValueError: if neither is a sensor there, or the head is another.
 
     Example:
         >>> system = any_camera_system(TiDyOptics(fidelity="draft"))
         >>> system.head(torch.rand(1, 3, 32, 48)).shape
         torch.Size([1, 3, 32, 48])
     """
+    check_choice("head", head, CLOSED_FORMS)
     camera = optics.with_fidelity(optics.fidelity)  # with the same parts
     camera.sensor, camera.color_space = camera.sensor if sensor is None else sensor, "srgb"
     if camera.sensor is None:
         raise ValueError("a network restores captures by their noise, and the camera has no sensor: give sensor=")
-    settings = SystemSettings(head=ANY_CAMERA)
-    head = build_head(settings)
-    update_psfs(head, camera)
-    return TrainedSystem(camera.eval(), head.eval(), settings, 0)
+    settings = SystemSettings(head=head)
+    network = build_head(settings)
+    update_psfs(network, camera)
+    return TrainedSystem(camera.eval(), network.eval(), settings, 0)
 
 
 def saved_system(path: str | os.PathLike[str], sensor: SensorNoise | None = None) -> TrainedSystem:

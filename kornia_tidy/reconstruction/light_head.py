@@ -13,11 +13,11 @@ from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead
 from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
-from kornia_tidy.reconstruction.closed_form import ClosedForm
+from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.self_ensemble import self_ensemble
@@ -95,7 +95,7 @@ class LightHead(nn.Module):
         self.camera = cast("ThinLensCamera", system.optics.camera)  # another one where no depth is estimated
         self.encoded = system.optics.color_space == "srgb"
         self.uncertain = system.settings.depth_classes > 0
-        behind = isinstance(system.head, AnyCameraHead) and system.optics.lens is not None
+        behind = system.settings.head in CLOSED_FORMS and system.optics.lens is not None
         self.field = (system.optics.psf_model, system.optics.field_center) if behind else None  # no part of the head
         self.eval()
 
@@ -122,6 +122,7 @@ def with_noise_of(head: LightHead, sensor: SensorNoise | None) -> LightHead:
         sensor: with a standard deviation in units of the captures' full scale. None: the noise does not change.
     """
     copied = cast("LightHead", shared_copy(head))
+    copied.field = head.field  # PSFs that it remembers serve all captures
     for module in copied.modules():
         if isinstance(module, ClosedForm) and sensor is not None:
             module.set_noise(sensor)
@@ -183,10 +184,10 @@ def reconstruct_light(
 
 
 def _over_field(head: LightHead, light: Tensor, model: PSFModel, center: tuple[float, float]) -> Tensor:
-    """Restore a capture through a real lens by the network for any camera, with the PSFs of each place."""
+    """Restore a capture through a real lens by a closed form, or the network for any camera, with the local PSFs."""
     own = shared_copy(head)
     form = next(part for part in own.modules() if isinstance(part, ClosedForm))
-    nodes = torch.linspace(*model.camera.defocus_range, form.layers, dtype=torch.float64).tolist()
+    nodes = torch.linspace(*model.camera.defocus_range, form.layers or NODES, dtype=torch.float64).tolist()
 
     def restore(part: Tensor, bank: PSFBank) -> Tensor:
         form.set_psfs(bank.at_defocus(nodes))

@@ -13,9 +13,12 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
 import kornia_tidy
-from kornia_tidy.data import DeadLeaves, PhotographicLeaves
+from kornia_tidy import ThinLensCamera
+from kornia_tidy.data import DeadLeaves, PhotographicLeaves, dead_leaves
 from kornia_tidy.reconstruction import receptive_field
+from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import (
     LightHead,
     UncertainReconstruction,
@@ -28,6 +31,7 @@ from kornia_tidy.reconstruction.tasks import channels_of
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, update_psfs
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
+from tests.reconstruction.test_restored_over_field import CORNER, camera
 
 
 class Passing(nn.Module):
@@ -112,6 +116,25 @@ class TestReconstructLight(BaseTester):
             result = reconstruct_light(light_head(task), light)
             assert (result.image is not None, result.depth is not None) == expected
         self.assert_close(result.image, linear_rgb_to_rgb(light))
+
+    @pytest.mark.parametrize("head", CLOSED_FORMS)
+    @torch.no_grad()
+    def test_feature_behind_a_lens_the_psfs_of_the_place_restore_better_than_those_of_the_axis(self, head):
+        """Near focus, at the corner of a single element, whose curvature defocuses it by 5 rad there."""
+        sensor, near_focus = SensorNoise(0.002), ThinLensCamera(depth_range=(0.58, 0.61))
+        optics = camera(field_center=CORNER, camera=near_focus, sensor=sensor, color_space="srgb")
+        image = dead_leaves(96, 96, seed=1)[0]
+        coded = optics(image, torch.full((1, 96, 96), 0.595), generator=torch.Generator().manual_seed(0))
+        system = any_camera_system(optics, head=head)
+        restored = reconstruct_light(LightHead(system), optics.decode(coded)).image
+        lost = [
+            float((x - image)[..., 16:-16, 16:-16].square().mean()) for x in (restored, system.head(coded[None])[0])
+        ]
+        assert lost[0] < 0.8 * lost[1]  # 1 dB
+
+    def test_exception_a_network_that_was_trained_is_for_no_other_camera(self):
+        with pytest.raises(ValueError, match=r"head must be one of 'tikhonov', .*, got 'nafnet'"):
+            any_camera_system(camera(), head="nafnet")
 
     def test_feature_depth_is_in_metres(self):
         """Linear colours, so that red light is inverse_depth: half is the focus distance of the default lens."""

@@ -6,23 +6,36 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from kornia_tidy.choices import ORIENTATIONS, PRETRAINED
+from kornia_tidy.choices import LENSES, ORIENTATIONS, PRETRAINED
+from kornia_tidy.cli.commands.lens_option import RealLens
 from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
-from kornia_tidy.cli.commands.shared import File, Folder, Noise, read_noise
+from kornia_tidy.cli.commands.shared import (
+    CameraSettings,
+    File,
+    Folder,
+    Masks,
+    Noise,
+    SceneLens,
+    read_noise,
+    refuse_with_psfs,
+)
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
+from kornia_tidy.reconstruction.settings import LensSettings
 from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
+    from kornia_tidy.camera.tidy_optics import TiDyOptics
     from kornia_tidy.lab.capture_file import CaptureLight
+    from kornia_tidy.sensor.sensor import SensorNoise
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructRaw:
     """All-in-focus pictures and depth of captures.
 
-    By a trained network, or by the closed form of a camera that was measured, tile by tile
-    within a memory budget and without visible seams.
+    By a trained network, or by a closed form for a camera that was measured or is given by
+    lens and masks, tile by tile within a memory budget and without visible seams.
     FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
       FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
       FILE_depth.png          depth, 16 bits, in multiples of --depth-unit
@@ -42,10 +55,15 @@ class ReconstructRaw:
         files: camera raw files, or pictures.
         output: where to; made if it is not there.
         head: a shipped system, a checkpoint of a training (best.safetensors), or the file of a camera, such as
-            camera.safetensors of kornia-tidy design, whose captures the network for any camera restores; or, with PSFs,
-            a closed form. None: with PSFs the network for any camera.
+            camera.safetensors of kornia-tidy design, whose captures the network for any camera restores; or, with
+            --psfs or --masks, a closed form. None: with these the network for any camera.
         psfs: file of kornia-tidy raw calibrate-psf; its PSFs deconvolve the captures. None:
             those of the network's camera.
+        masks: of the camera: a file of heights, or the number of those that raw simulate makes. None: those of head or
+            psfs.
+        lens: a real lens around them, by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json).
+            The capture is the whole picture, and each tile is restored by the PSFs of its place. None: an ideal lens.
+        settings: of the camera with these masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
@@ -70,6 +88,9 @@ class ReconstructRaw:
     output: Folder
     head: Annotated[str, one_of((*PRETRAINED, *CLOSED_FORMS), others=True)] | None = None
     psfs: File | None = None
+    masks: Masks | None = None
+    lens: RealLens | None = None
+    settings: LensSettings = field(default_factory=LensSettings)
     noise: Noise | None = None
     resume: bool = False
     format: Format = "png"
@@ -84,11 +105,12 @@ class ReconstructRaw:
     dump: Dump = field(default_factory=Dump)
 
     basic: ClassVar = (
-        *("files", "output", "head", "psfs", "noise", "resume", "format", "depth_unit", "linear", "white_balance"),
-        *("jobs", "memory", "orientations", "device"),
+        *("files", "output", "head", "psfs", "masks", "lens", "noise", "resume", "format", "depth_unit", "linear"),
+        *("white_balance", "jobs", "memory", "orientations", "device"),
     )
     notes: ClassVar = """\
-Without a network of your camera, give the camera: its file as HEAD, or its measured PSFs.
+Without a network of your camera, give the camera: its file as HEAD, its measured PSFs, or
+its masks with its lens.
 One network, any-camera, restores the captures of any camera that it is told. All others fit
 the camera that they were trained with, its masks and its lens. The library includes, for a
 50 mm lens and pixels of 8 um
@@ -105,7 +127,8 @@ since the PSFs are defined there. Then the encoding of the network's training is
 (sRGB unless --color-space was linear or paper). The results are turned upright.
 
 Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
-for the program; in all 1.8 GiB for a file of 24 megapixels.
+for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens tiles have
+384 pixels along a side, whatever --memory and --overlap say.
 """
     examples: ClassVar = """\
   All files of a folder; if interrupted, go on with --resume:
@@ -117,6 +140,10 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
   A camera of your own design, and one that was measured, without training:
     kornia-tidy raw reconstruct shots/*.dng --head camera.safetensors -o sharp
     kornia-tidy raw reconstruct shots/*.dng --psfs bank.safetensors --noise iso800.json -o sharp
+
+  The same camera by its masks and its real lens, whose PSFs vary over the picture:
+    kornia-tidy raw reconstruct shots/*.dng --masks heights.npy --lens single-50mm \\
+        --f-number 12 --focus-distance 0.7 --noise iso800.json -o sharp
 
   A network of one's own; of two files, one is read and written while the other is computed:
     kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
@@ -138,7 +165,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         if self.noise == 0:
             raise ValueError("noise must be positive and finite in units of full scale, got 0.0")
         sensor, _ = read_noise(self.noise)
-        system = load_system(self.head, self.psfs, sensor)
+        optics = self._optics(sensor)
+        system = load_system(self.head, self.psfs, sensor, optics)
         if self.noise is not None and not takes_noise(system.head):
             raise ValueError(f"--noise is for a network that takes it, and that of {self.head} does not")
         if self.psfs is not None and not takes_psfs(system.head):
@@ -147,11 +175,12 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
 
         def read(path: str) -> CaptureLight:
             capture = self._read(path)
-            if self.psfs is not None:
+            if self.psfs is not None or optics is not None:
                 check_capture(system, path, capture)
             return capture
 
         words = {"head": self.head or ANY_CAMERA} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
+        words |= {"lens": self.lens} if self.lens else {}
         folder = Path(self.output)
         rows = reconstruct_files(
             self.files,
@@ -168,7 +197,9 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
             overlap=self.overlap,
         )
         kind = system.settings
-        tell("network", f"{self.head or self.psfs}: {kind.task}, {kind.head!r}, {system.step} steps")
+        if optics is not None and optics.lens is not None:
+            tell("lens", optics.lens.extra_repr())
+        tell("network", f"{self.head or self.psfs or ANY_CAMERA}: {kind.task}, {kind.head!r}, {system.step} steps")
         failed = sum(row.result not in {"done", "kept"} for row in rows)
         for line in table(rows):
             print(line)
@@ -178,6 +209,36 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         tell("files", f"{len(rows) - failed} of {len(rows)} in {folder}")
         if failed:
             raise ValueError(f"{failed} of {len(rows)} files failed")
+
+    def _given(self) -> dict[str, Any]:
+        """Return the options of a camera that were given, by name."""
+        usual = LensSettings()
+        given = {"masks": self.masks, "lens": self.lens}
+        given |= {name: value for name, value in vars(self.settings).items() if value != getattr(usual, name)}
+        return {name: value for name, value in given.items() if value is not None}
+
+    def _optics(self, sensor: SensorNoise | None) -> TiDyOptics | None:
+        """Return the camera of lens and masks, if it is given so.
+
+        Raises:
+            ValueError: if the head or the PSFs have a camera of their own, or there are no masks.
+        """
+        from kornia_tidy.sensor.sensor import SensorNoise
+
+        if not (given := self._given()):
+            return None
+        option = f"--{next(iter(given)).replace('_', '-')}"
+        if self.psfs is not None:
+            refuse_with_psfs(given)
+        if self.head is not None and self.head not in CLOSED_FORMS:
+            raise ValueError(
+                f"{self.head} has a camera of its own: leave out {option}, or take one of "
+                f"{', '.join(map(repr, CLOSED_FORMS))} as --head"
+            )
+        if self.masks is None:
+            raise ValueError(f"{option} is of a camera whose masks are needed too: give --masks")
+        camera = CameraSettings(lens=SceneLens(**vars(self.settings), lens=self.lens), masks=self.masks)
+        return camera.optics(None, sensor=sensor or SensorNoise())
 
     def _read(self, path: str) -> CaptureLight:
         """Return the linear light of a capture."""
@@ -198,12 +259,14 @@ for the program; in all 1.8 GiB for a file of 24 megapixels.
         """Return what results depend on beside their file, to recognise them on resuming."""
         from kornia_tidy.lab.named_system import digests
 
+        given = self._given()
+        files = [given[name] for name in ("masks", "lens") if isinstance(given.get(name), str)]
         return {
-            "system": digests(self.head, self.psfs, self.noise),
+            "system": digests(self.head, self.psfs, self.noise, *(file for file in files if file not in LENSES)),
             "depth_unit": self.depth_unit,
             "linear": self.linear,
             "overlap": self.overlap,
             "orientations": self.orientations,
             "white_balance": self.white_balance or None,
             "dump": {name: value or None for name, value in vars(self.dump).items()},
-        }
+        } | ({"camera": {name: str(value) for name, value in given.items()}} if given else {})

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -9,12 +10,15 @@ from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import write_image
+from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.rgbd import read_rgbd
 from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.develop import develop
 from kornia_tidy.lab.raw.simulation import simulate_scene
+from kornia_tidy.optics import Lens
+from kornia_tidy.reconstruction.camera_system import any_camera_system
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from tests.base import BaseTester
 
 SCENE = ["raw", "simulate", "--image", "image.png", "--depth", "depth.pfm", "--fidelity", "draft", "--masks", "1"]
@@ -90,3 +94,53 @@ class TestRawSimulate(BaseTester):
         assert main([*SCENE, *arguments]) == 2
         assert message in capsys.readouterr().err
         assert not list(scene.glob("*.dng"))
+
+
+class TestThereAndBack(BaseTester):
+    """`raw simulate` and `raw reconstruct` with the same lens and masks."""
+
+    CAMERA = ("--masks", "1", "--f-number", "12", "--focus-distance", "0.65", "--depth-range", "0.5", "0.8")
+
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize(("head", "lens"), [("wiener", "single-50mm"), (None, "own.safetensors")])
+    def test_feature_a_capture_behind_a_real_lens_is_restored_as_in_python(self, scene, head, lens, capsys):
+        made = Lens.named("single-50mm", 12.0, 0.65)
+        made.save("own.safetensors")
+        write_depth("depth.pfm", torch.full((1, 72, 80), 0.65))
+        words = self.CAMERA if lens == "single-50mm" else ("--masks", "1", "--depth-range", "0.5", "0.8")
+        assert main([*SCENE, *words, "--lens", lens, "-o", "shot.dng"]) == 0
+        command = ["raw", "reconstruct", "shot.dng", *words, "--lens", lens, "--noise", "0.003", "-o", "sharp"]
+        command += [] if head is None else ["--head", head]
+        assert main(command) == 0
+        assert "50 mm f/12, focus at 0.65 m" in capsys.readouterr().out
+        masks, sensor = PixelwiseMask(1, generator=seeded(0)), SensorNoise(0.003)
+        optics = TiDyOptics(masks, made.camera(8e-6, (0.5, 0.8)), lens=made, sensor=sensor)
+        system = any_camera_system(optics) if head is None else any_camera_system(optics, head=head)
+        light = develop(RawCapture.open("shot.dng"), encoded=False)
+        wanted, found = reconstruct_light(LightHead(system), light).image, read_image("sharp/shot.png")
+        self.assert_close(found, wanted, rtol=0, atol=1e-3)
+        self.assert_close(found.mean(), read_image("image.png").mean(), rtol=0, atol=0.05)
+        assert main([*command, "--resume"]) == 0
+        assert "kept" in capsys.readouterr().out
+        assert main([*command, "--resume", "--pixel-pitch", "7e-6"]) == 0
+        assert "kept" not in capsys.readouterr().out
+        assert json.loads((scene / "sharp" / "shot.json").read_text())["made_by"]["camera"]["lens"] == lens
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (["--lens", "single-50mm"], "--lens is of a camera whose masks are needed too: give --masks"),
+            (["--f-number", "8"], "--f-number is of a camera whose masks are needed too: give --masks"),
+            (["--masks", "1", "--lens", "lens"], "--lens must be one of 'double-gauss-50mm'"),
+            (["--masks", "gone.npy"], "gone.npy"),
+            (["--masks", "1", "--lens", "single-50mm", "--focal-length", "0.04"], "leave out --focal-length"),
+            (["--lens", "single-50mm", "--head", "edof-5"], "edof-5 has a camera of its own: leave out --lens"),
+            (["--masks", "1", "--head", "camera.safetensors"], "camera.safetensors has a camera of its own"),
+            (["--masks", "1", "--psfs", "bank.safetensors"], "--psfs has a lens, masks and distances of its own"),
+            (["--masks", "1"], "the noise of image.png is not known: give --noise"),
+        ],
+    )
+    def test_exception_is_one_sentence_and_nothing_is_written(self, scene, capsys, words, sentence):
+        assert main(["raw", "reconstruct", "image.png", *words, "-o", "sharp"]) == 2
+        assert sentence in capsys.readouterr().err
+        assert not list(scene.glob("sharp/*"))
