@@ -151,6 +151,9 @@ def field_psf_bank(
         window: side P of the PSFs in pixels, odd.
         tolerance: error allowed to the integrals over sensor pixels, as for the PSFs of an ideal lens.
 
+    Raises:
+        ValueError: if no light passes the pupil within the lens's stop.
+
     Convention:
         - PSFs of a channel are centred on its mean position: they contain the lateral colour within the channel, but
           not between channels.
@@ -175,6 +178,11 @@ def field_psf_bank(
             continue
         axis, *turned = turned_lenses(lens, metres, defocus, wavelength)
         on_axis = lens_light(whole_cells(pupil), pupil.transmission, axis, sensor.tolerance).to(weights)
+        if not bool((on_axis > 0).all()):  # False for NaN too
+            raise ValueError(
+                f"aperture must let some light through the lens's stop and be finite, got an open area of "
+                f"{float(on_axis.min())}"
+            )
         for f, (seen_there, shifts) in enumerate(zip(turned, apart, strict=True)):
             shown = weights, pupil.transmission, seen_there, sensor
             energies, area = lens_psfs(screens[w], *shown, shifts[w, seen].tolist())

@@ -86,14 +86,17 @@ def lens_psfs(
     columns = scattered_axis(columns, *settings, [shift[1] for shift in shifts])
     rows = scattered_axis(rows, *settings, [shift[0] for shift in shifts])
     passed, area = turned.light(*stops[-1], transmission)
+    passed = torch.where(passed == 0, 1, passed)  # where the rims cut all that the aperture leaves open it is dark
     amplitude = torch.cat([turned.amplitude(*stop) for stop in stops], 1)
-    amplitude = amplitude * (sensor.pitch / wavelength / passed.sqrt())[:, None, None]
+    amplitude = amplitude * (sensor.pitch / wavelength / passed.detach().sqrt())[:, None, None]
     phase = torch.cat([turned.phase(stop) for stop in stops], 1)
     device = weights.device
     patches = patches_of(torch.polar(amplitude, phase).to(complex_dtype), rows, columns).to(device)
     chosen = [(p.row.to(device), p.column.to(device)) for p in points]
     cells = torch.cat([s.waves[:, row, column] for s, (row, column) in zip(screens, chosen, strict=True)], 1)
     energies = scattered_energies(cells, weights, patches, rows.to(device), columns.to(device))
+    if passed.requires_grad:  # of a learnt amplitude
+        energies = energies * (passed.detach() / passed).to(energies)[:, None, None, None]
     return energies, area.to(weights)
 
 

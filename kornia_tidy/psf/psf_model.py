@@ -63,7 +63,7 @@ class CachedParts:
         self.blur: WideBlur | None = None
         self.blur_known = False
         self.fields: dict[object, Field] = {}  # by size and place of the picture, and what else they follow from
-        self.light: tuple[object, Tensor] | None = None  # over the field, and what for
+        self.light: tuple[object, Tensor, Tensor] | None = None  # what for, through which pupil, and over the field
         self.lit: tuple[PSFBank, FieldBank] | None = None  # the last PSFs, and the same with their light
 
     def __getstate__(self) -> dict[str, Any]:
@@ -86,7 +86,8 @@ class PSFModel:
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), with N the shorter side, or finer by a whole factor.
             Default: the pixels with centres in the disc; the smooth disc for ``NoMask``. An ``nn.Parameter``,
-            (N, N) or one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
+            (N, N) or, without a lens, one for each mask (K, N, N), is learnt: see
+            :class:`~kornia_tidy.psf.LearnableAperture`.
         lens: a :class:`~kornia_tidy.optics.Lens` with the masks in its stop, or the name of one, made for the
             camera's aperture and focus. Its stop and its rims cut the masks exactly, besides ``aperture``. Default: an
             ideal lens.
@@ -163,7 +164,7 @@ class PSFModel:
 
         Raises:
             TypeError: if a part is of another type.
-            ValueError: if the lens is not that of the camera.
+            ValueError: if the lens is not that of the camera, or a learnable aperture behind it is one for each mask.
 
         Example:
             >>> model = PSFModel(fidelity="draft").replace(masks=PixelwiseMask(1, initial="flat"))
@@ -188,8 +189,12 @@ class PSFModel:
         if present["lens"] is not None:
             given = (present[name] for name in ("lens", "camera", "fidelity", "_sampled"))
             parts["lens"] = fitting_lens(*given)
-            if isinstance(present["aperture"], (nn.Parameter, LearnableAperture)):
-                raise ValueError("a learnable aperture needs an ideal lens, got a lens with a stop of its own")
+            learnt = present["aperture"]
+            if isinstance(learnt, LearnableAperture) and learnt.amplitude.ndim == 3:
+                raise ValueError(
+                    f"a learnable aperture behind a real lens must be one (N, N) for all masks, got "
+                    f"{tuple(learnt.amplitude.shape)}"
+                )
         return self._replace(_derived=CachedParts(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
@@ -333,11 +338,13 @@ class PSFModel:
         bank, derived = self.scene_bank(channels, dtype, defocus, points=field.points), self._derived
         if (known := derived.lit) is None or known[0] is not bank:
             lens, pitch = cast("Lens", self.lens), self.camera.pixel_pitch
-            asked, found = (bank.defocus.tolist(), field.points, channels, lens.table, pitch), derived.light
-            if found is None or found[0] != asked:
-                given = self.pupil, self.spectrum_of(channels).flat(), *asked[:2], lens, pitch
-                found = derived.light = asked, field_light(*given)
-            light = found[1].to(bank.psfs)
+            pupil, asked = self.pupil, (bank.defocus.tolist(), field.points, channels, lens.table, pitch)
+            passed, found = pupil.transmission, derived.light
+            if found is None or found[0] != asked or passed.requires_grad or not torch.equal(found[1], passed):
+                given = pupil, self.spectrum_of(channels).flat(), *asked[:2], lens, pitch
+                found = asked, passed, field_light(*given)
+                derived.light = None if passed.requires_grad else found
+            light = found[2].to(bank.psfs)
             light = light.repeat_interleave(bank.psfs.shape[1] // light[:, 0].numel(), 2)
             each, within = (-1, light.shape[-1]), light.movedim(1, 0)
             psfs = bank.psfs.unflatten(1, each) * within[..., None, None]
@@ -735,6 +742,8 @@ class PSFModel:
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
         if not isinstance(self.aperture, LearnableAperture):
             return pupil
+        if self.lens is not None:
+            return pupil.cut_by_a_lens(self.aperture())
         pupil, shown = pupil.with_learnt(self.aperture()), self.state if self.moment is None else self.moment
         return pupil if shown is None else pupil.of_masks(slice(shown, shown + 1))
 

@@ -76,6 +76,13 @@ class Pupil:
         vars(pupil).update(amplitude=amplitude / light.sqrt(), transmission=transmission, light=1.0)
         return pupil
 
+    def cut_by_a_lens(self, amplitude: Tensor) -> Pupil:
+        """Return this pupil with a learnt amplitude (n, n), not scaled to one light: a lens's stop cuts it too."""
+        pupil, transmission = copy.copy(self), amplitude.double().square()
+        light = float(transmission.detach().sum()) * self.cell_pitch**2
+        vars(pupil).update(amplitude=amplitude, transmission=transmission.cpu(), light=light)
+        return pupil
+
     def of_masks(self, masks: slice) -> Pupil:
         """Return the pupil of some of the masks: itself, unless each has its own amplitude."""
         if self.amplitude.ndim == 2:

@@ -113,6 +113,7 @@ FEATURES: dict[str, tuple[Callable[[], TiDyOptics], Callable[..., Tensor]]] = {
     "many wavelengths": (lambda: camera(spectrum=camera_spectrum(samples=4)), at_once),
     "reflectance spectra": (lambda: camera(spectrum=camera_spectrum(samples=4, reflectance=True)), at_once),
     "amplitudes": (lambda: camera(aperture=amplitude()), at_once),
+    "learnt amplitudes": (lambda: camera(aperture=nn.Parameter(amplitude())), at_once),
     "veil": (lambda: camera(fidelity=SETTINGS.replace(stray_light="veil")), at_once),
     "cubic layers": (lambda: camera(fidelity=SETTINGS.replace(layers="cubic")), at_once),
     "nearest layers": (lambda: camera(fidelity=SETTINGS.replace(layers="nearest")), at_once),
@@ -150,15 +151,16 @@ class TestEveryFeature(BaseTester):
 
 class TestGradients(BaseTester):
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    @pytest.mark.parametrize("learnt", ["masks", "dwell times"])
+    @pytest.mark.parametrize("learnt", ["masks", "dwell times", "amplitude"])
     def test_gradcheck_along_a_direction(self, learnt, compositing):
         """Against the difference of two captures, to 1e-3."""
         settings = SETTINGS.replace(double=True, occlusion_states="mean")
         parts = {"fidelity": settings, "compositing": compositing, "modulator": LearnableDwellTimes((1.0, 2.0))}
-        optics = camera(aperture=amplitude(), **parts).double()
+        optics = camera(aperture=nn.Parameter(amplitude()), **parts).double()
         image, depth = (part.double() for part in scene())
         weight = torch.rand(image.shape, generator=seeded(5)).double()
-        parameter = {"masks": optics.masks.phase, "dwell times": optics.modulator.logits}[learnt]
+        parameters = {"masks": optics.masks.phase, "dwell times": optics.modulator.logits}
+        parameter = {**parameters, "amplitude": optics.aperture.amplitude}[learnt]
         (optics(image, depth) * weight).sum().backward()
         direction = torch.rand(parameter.shape, generator=seeded(6), dtype=torch.float64) - 0.5
         expected, ends = float((parameter.grad * direction).sum()), []

@@ -19,6 +19,7 @@ from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0)
 EXACT = Fidelity(window=5, layer_spacing=20.0, double=True)
+LENS = Lens.named("single-50mm", 17.6, 0.595)
 
 
 def apertures(count: int = 3, size: int = 23, dtype: torch.dtype = torch.float32) -> nn.Parameter:
@@ -30,6 +31,11 @@ def camera(aperture, masks=3, **options) -> TiDyOptics:
     torch.manual_seed(1)
     options = {"fidelity": SMALL, "sensor": None, "color_space": "linear", **options}
     return TiDyOptics(PixelwiseMask(masks), aperture=aperture, **options)
+
+
+def through_a_lens(aperture) -> TiDyOptics:
+    given = {"camera": LENS.camera(8e-6), "lens": LENS, "field_center": (400.0, -480.0)}
+    return camera(aperture, fidelity=SMALL.replace(field_tolerance=0.1), **given)
 
 
 def scene(dtype=torch.float32):
@@ -72,9 +78,8 @@ class TestLearnableAperture(BaseTester):
             camera(apertures(2))
         with pytest.raises(ValueError, match=r"shows the 3 masks one by one, such as .*, got"):
             camera(apertures(), modulator=Switching(8e-3))
-        lens = Lens.named("single-50mm", 17.6, 0.595)
-        with pytest.raises(ValueError, match="a learnable aperture needs an ideal lens"):
-            camera(nn.Parameter(torch.ones(23, 23)), camera=lens.camera(8e-6), lens=lens)
+        with pytest.raises(ValueError, match=r"behind a real lens must be one .* for all masks, got \(3, 23, 23\)"):
+            camera(apertures(), camera=LENS.camera(8e-6), lens=LENS)
 
     def test_exception_learning_that_closed_it(self):
         optics = camera(apertures())
@@ -95,6 +100,43 @@ class TestLearnableAperture(BaseTester):
         self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
         same = camera(nn.Parameter(amplitude.expand(3, 23, 23).clone()), compositing=compositing)
         self.assert_close(same(*scene()), given(*scene()), rtol=0, atol=1e-6)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_behind_a_lens_it_is_the_given_aperture(self, compositing):
+        amplitude = apertures(1)[0].detach()
+        learnt, given = through_a_lens(nn.Parameter(amplitude)), through_a_lens(amplitude)
+        learnt.compositing = given.compositing = compositing
+        self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
+
+    def test_feature_behind_a_lens_captures_follow_it(self):
+        """Whatever was captured before, with gradients and without, a capture is that of a new camera."""
+        optics, generator = through_a_lens(nn.Parameter(apertures(1)[0].detach())), torch.Generator().manual_seed(7)
+        for step in range(8):
+            with torch.set_grad_enabled(step % 3 == 1):
+                found = optics(*scene())
+            if found.requires_grad:
+                found.sum().backward()
+            given = through_a_lens(optics.aperture().detach().clone())
+            given.field_center = optics.field_center
+            self.assert_close(found.detach(), given(*scene()).detach(), rtol=0, atol=1e-6)
+            with torch.no_grad():
+                optics.aperture.amplitude.mul_(0.5 + torch.rand(23, 23, generator=generator))
+            optics.field_center = (400.0 * (step // 2 % 2), -480.0)
+
+    def test_feature_behind_a_lens_only_what_its_stop_leaves_open_is_learnt(self):
+        optics = through_a_lens(nn.Parameter(apertures(1)[0].detach()))
+        optics(*scene()).square().sum().backward()
+        from_axis = (torch.arange(23) - 11.0).abs()
+        nearest = torch.hypot(*torch.meshgrid(*2 * [(from_axis - 0.5).clamp(min=0)], indexing="ij"))
+        reached = optics.aperture.amplitude.grad != 0
+        assert torch.equal(reached, nearest < 10)  # 10 mask pixels a stop radius
+
+    @pytest.mark.parametrize("learnt", [False, True])
+    def test_exception_open_only_where_the_lens_is_shut(self, learnt):
+        amplitude = torch.zeros(23, 23)
+        amplitude[:, 0] = 1
+        with pytest.raises(ValueError, match=r"through the lens's stop and be finite, got an open area of 0\.0"):
+            through_a_lens(nn.Parameter(amplitude) if learnt else amplitude)(*scene())
 
     def test_feature_the_papers_fidelity(self):
         amplitude = 0.5 * circular_aperture(23).float()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy import NoMask, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics import Lens, Spectrum, circular_aperture
@@ -98,6 +98,22 @@ class TestLensPSFs(BaseTester):
         thin = PSFModel(masks, lens.camera(8e-6), spectrum=GREY, fidelity=SMALL, aperture=fine).psf_bank(defocus=[5.0])
         found = model(lens, masks, aperture=half).psf_bank(defocus=[5.0], field=[(0.0, 0.0)])
         assert float((found.psfs[0] - thin.psfs).detach().norm() / thin.psfs.detach().norm()) < 5e-3
+
+    @pytest.mark.parametrize("learnt", [False, True])
+    def test_feature_dark_where_the_rim_cuts_all_that_the_aperture_leaves_open(self, learnt):
+        surfaces = [{"kind": "stop", "t": 10.0}, {"R": 25.9, "t": 3.5, "glass": "N-BK7", "r": 1.5}, {"R": None, "t": 0}]
+        given = {"name": "rim", "unit": "mm", "surfaces": surfaces, "index": {"N-BK7": {"nd": 1.5168, "vd": 64.17}}}
+        lens = Lens.from_prescription(given, 17.6, 0.6, wavelengths=(530e-9,), field=5e-3)
+        open_part = torch.zeros(23, 23, dtype=torch.float64)
+        open_part[9:14, 20] = 1
+        aperture = torch.nn.Parameter(open_part) if learnt else open_part
+        found = model(lens, NoMask(23), aperture=aperture).psf_bank(defocus=[0.0], field=[(0.0, 0.0), (0.0, 625.0)])
+        assert float(found.psfs[0].detach().sum()) > 0.5
+        assert not found.psfs[1].any()
+        assert not found.light[1].any()
+        if learnt:
+            found.psfs.square().sum().backward()
+            assert bool(aperture.grad.isfinite().all())
 
     def test_feature_gaps_between_mask_pixels(self):
         lens, masks = Lens.from_seidel(50e-3, 17.6, 0.595, 7e-3), random_mask(3)
