@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import LENSES, ORIENTATIONS, PRETRAINED
-from kornia_tidy.cli.commands.lens_option import RealLens
+from kornia_tidy.cli.commands.lens_option import RealLens, camera_and_lens
 from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
 from kornia_tidy.cli.commands.shared import (
-    CameraSettings,
     File,
     Folder,
     Masks,
     Noise,
-    SceneLens,
+    masks_of,
     read_noise,
     refuse_with_psfs,
 )
@@ -62,7 +62,8 @@ class ReconstructRaw:
         masks: of the camera: a file of heights, or the number of those that raw simulate makes. None: those of head or
             psfs.
         lens: a real lens around them, by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json).
-            The capture is the whole picture, and each tile is restored by the PSFs of its place. None: an ideal lens.
+            Captures are whole pictures, as large as the first; each tile is restored by the PSFs of its place. None: an
+            ideal lens.
         settings: of the camera with these masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
@@ -223,6 +224,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
         Raises:
             ValueError: if the head or the PSFs have a camera of their own, or there are no masks.
         """
+        from kornia_tidy.camera.tidy_optics import TiDyOptics
         from kornia_tidy.sensor.sensor import SensorNoise
 
         if not (given := self._given()):
@@ -237,8 +239,17 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             )
         if self.masks is None:
             raise ValueError(f"{option} is of a camera whose masks are needed too: give --masks")
-        camera = CameraSettings(lens=SceneLens(**vars(self.settings), lens=self.lens), masks=self.masks)
-        return camera.optics(None, sensor=sensor or SensorNoise())
+        size = None if self.lens is None else self._size()
+        camera, lens = camera_and_lens(self.lens, self.settings, size=size)
+        return TiDyOptics(masks_of(self.masks), camera, sensor=sensor or SensorNoise(), lens=lens)
+
+    def _size(self) -> tuple[int, int] | None:
+        """Return rows and columns of the first capture that can be read, over which a lens is traced."""
+        for path in self.files:
+            with suppress(OSError, ValueError):
+                light = self._read(path).light
+                return light.shape[-2], light.shape[-1]
+        return None
 
     def _read(self, path: str) -> CaptureLight:
         """Return the linear light of a capture."""

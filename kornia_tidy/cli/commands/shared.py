@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from kornia_tidy.camera.tidy_optics import TiDyOptics
     from kornia_tidy.data.rgbd import Scene
     from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
+    from kornia_tidy.masks.pixelwise import PixelwiseMask
     from kornia_tidy.optics.thin_lens import ThinLensCamera
     from kornia_tidy.psf.psf_bank import PSFBank
     from kornia_tidy.sensor.sensor import SensorNoise
@@ -208,11 +209,7 @@ class CameraSettings:
         Raises:
             ValueError: if ``--psfs`` comes with an option for a measured property.
         """
-        import torch
-
         from kornia_tidy.camera.tidy_optics import TiDyOptics
-        from kornia_tidy.lab.mask_export.mask_files import read_heights
-        from kornia_tidy.masks.pixelwise import PixelwiseMask
 
         if self.psfs is not None:
             from kornia_tidy.lab.calibration.psf.measured_camera import measured_camera
@@ -221,15 +218,9 @@ class CameraSettings:
             given = [name for name in ("masks", "mask_seed") if getattr(self, name) is not None]
             refuse_with_psfs([*of_lens, *given])
             return measured_camera(self.psfs, **options)
-        if isinstance(self.masks, str):
-            if self.mask_seed is not None:
-                raise ValueError(
-                    "--mask-seed is of masks of random height, and --masks is a file: leave one of them out"
-                )
-            shown = PixelwiseMask(initial=read_heights(self.masks))
-        else:
-            generator = torch.Generator().manual_seed(self.mask_seed or 0)
-            shown = PixelwiseMask(MASKS if self.masks is None else self.masks, generator=generator)
+        if isinstance(self.masks, str) and self.mask_seed is not None:
+            raise ValueError("--mask-seed is of masks of random height, and --masks is a file: leave one of them out")
+        shown = masks_of(MASKS if self.masks is None else self.masks, self.mask_seed or 0)
         return TiDyOptics(shown, **self.lens.optics_for(scene), **options)
 
     def in_words(self, optics: TiDyOptics) -> str:
@@ -238,6 +229,23 @@ class CameraSettings:
             return f"as they were when the PSFs of {self.psfs} were measured"
         origin = self.masks if isinstance(self.masks, str) else f"noise of seed {self.mask_seed or 0}"
         return f"{optics.masks.extra_repr()}, {origin}"
+
+
+def masks_of(masks: int | str, seed: int = 0) -> PixelwiseMask:
+    """Return the masks of ``--masks``: a number of them of random height, or those of a file of heights.
+
+    Raises:
+        FileNotFoundError: if the file is missing.
+        ValueError: if it cannot be read, or has no masks.
+    """
+    import torch
+
+    from kornia_tidy.lab.mask_export.mask_files import read_heights
+    from kornia_tidy.masks.pixelwise import PixelwiseMask
+
+    if isinstance(masks, str):
+        return PixelwiseMask(initial=read_heights(masks))
+    return PixelwiseMask(masks, generator=torch.Generator().manual_seed(seed))
 
 
 def refuse_with_psfs(given: Iterable[str]) -> None:

@@ -126,6 +126,15 @@ class TestThereAndBack(BaseTester):
         assert "kept" not in capsys.readouterr().out
         assert json.loads((scene / "sharp" / "shot.json").read_text())["made_by"]["camera"]["lens"] == lens
 
+    def test_feature_the_lens_is_traced_to_the_corner_of_the_first_file_that_is_there(self, scene, capsys):
+        write_image("wide.png", torch.rand(3, 40, 1800))
+        words = [*self.CAMERA, "--lens", "triplet-50mm", "--noise", "0.01", "-o", "sharp"]
+        assert main(["raw", "reconstruct", "gone.png", "wide.png", *words, "--head", "tikhonov"]) == 2
+        told = capsys.readouterr()
+        assert "field to 7.2 mm" in told.out
+        assert "1 of 2 in sharp" in told.out
+        assert "asked for a field" not in told.err
+
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
