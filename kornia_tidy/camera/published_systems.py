@@ -22,8 +22,11 @@ from kornia_tidy.masks.spiral import SpiralMask
 from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.modulator.modulator import DiffractionEfficiency, DwellTimes
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.optics.lens.prescription import Prescription, Surface
 from kornia_tidy.optics.materials import NOA61, PMMA
-from kornia_tidy.optics.published_systems import SITZMANN_PLATE, published_system
+from kornia_tidy.optics.published_systems import SITZMANN_PLATE, SYSTEMS, System, published_system
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.sensor.sensor import SensorNoise
 
 
@@ -34,12 +37,14 @@ def published_parts(name: str, generator: torch.Generator | None = None, **overr
         name: of the system.
         generator: source of the noise of masks that start from noise. Default: the global generator.
         overrides: arguments that replace the system's. The iris is sampled on the pixels of given masks.
+            ``lens="own"`` takes the single element of ``chang2019`` or ``sitzmann2018``, see :func:`single_element`.
 
     Returns:
         Keyword arguments by name.
 
     Raises:
-        ValueError: if the name is unknown; the message lists the known ones.
+        ValueError: if the name is unknown; the message lists the known ones. If ``lens="own"`` is asked of a system
+            that is no single element.
 
     Example:
         >>> parts = published_parts("ikoma2021")
@@ -49,6 +54,11 @@ def published_parts(name: str, generator: torch.Generator | None = None, **overr
     system = published_system(name)
     masks = overrides["masks"] if overrides.get("masks") is not None else MASKS[name](generator)
     size = min(masks.phase.shape[-2:])
+    if overrides.get("lens") == "own":
+        lens = single_element(system, overrides.get("spectrum"))
+        own = system.camera()
+        colourless = lens.camera(own.pixel_pitch, own.depth_range)  # the colours are those of the lens
+        overrides = {"camera": colourless, "aperture": None, **overrides, "lens": lens}
     parts = {
         "camera": system.camera,
         "modulator": lambda: DwellTimes() if system.modulated == 1 else DiffractionEfficiency(system.modulated),
@@ -57,6 +67,50 @@ def published_parts(name: str, generator: torch.Generator | None = None, **overr
     }
     made = {part: make() for part, make in parts.items() if part not in overrides}
     return {"compositing": system.compositing, "spectrum": system.spectrum, **made, **overrides, "masks": masks}
+
+
+def single_element(system: System, spectrum: Spectrum | None = None) -> Lens:
+    r"""Return the lens of a published system that is a single element, traced from its surfaces.
+
+    .. math:: R = (n(530\,\mathrm{nm}) - 1) \, f
+
+    Args:
+        system: ``chang2019`` or ``sitzmann2018``, whose cameras have a ``lens_material``.
+        spectrum: wavelengths that the lens is for. Default: those of the system.
+
+    Raises:
+        ValueError: if the system is no single element.
+
+    Convention:
+        - Focal length, f-number, focus and material are those of the system; ``System.sources`` says which are guesses.
+        - The initial plate of ``sitzmann2018`` is known to be plano-convex with this radius R. Its code approximates
+          the sphere by a paraboloid.
+        - The plano-convex shape of ``chang2019`` is assumed. For both systems so are a sphere towards the scene, a
+          thickness of 3 mm, a stop with the mask at the sphere's vertex, and a field up to 5 mm.
+        - Astigmatism and field curvature of a thin element in the stop follow from focal length and index, whatever its
+          shape. Spherical aberration and coma are those of the assumed shape.
+
+    Source: Welford, Aberrations of Optical Systems (1986), on the thin lens with the stop in contact.
+
+    Example:
+        >>> lens = single_element(published_system("sitzmann2018"))
+        >>> round(lens.focal_length * 1e3, 2), round(lens.f_number, 2), lens.residual < 1e-3
+        (34.28, 6.85, True)
+    """
+    camera = system.camera()
+    glass = camera.lens_material
+    if glass is None:
+        elements = [name for name, other in SYSTEMS.items() if other.camera().lens_material is not None]
+        raise ValueError(f"lens='own' is known of the single elements {' and '.join(elements)}, got {system.name!r}")
+    radius = (glass.index(REFERENCE_WAVELENGTH) - 1) * camera.focal_length
+    surfaces = Surface(0.0, is_stop=True), Surface(1 / radius, gap=_THICKNESS, glass=glass.name), Surface(0.0)
+    element = Prescription(system.name, system.paper, surfaces, {glass.name: glass})
+    waves = sorted({*(spectrum or system.spectrum).wavelengths, REFERENCE_WAVELENGTH})
+    given = camera.f_number, float(camera.focus_distance), waves, _FIELD, camera.depth_range[0]
+    return Lens.from_prescription(element, *given)
+
+
+_THICKNESS, _FIELD = 3e-3, 5e-3  # m, both assumed
 
 
 def _pixelwise(count: int) -> Callable[[torch.Generator | None], PhaseMasks]:

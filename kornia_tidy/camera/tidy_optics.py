@@ -196,6 +196,8 @@ class TiDyOptics(CameraState):
                 describes each system and the source of each value.
             generator: source of the noise that masks start from, where they do. Default: the global generator.
             overrides: arguments of the class that replace the system's, such as ``fidelity``, ``sensor`` or ``camera``.
+                ``lens="own"`` is the single element of ``chang2019`` or ``sitzmann2018`` as a real lens, see
+                :func:`~kornia_tidy.camera.published_systems.single_element`.
 
         Raises:
             ValueError: if no system has this name, or an override contradicts another argument.

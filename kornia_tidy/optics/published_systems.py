@@ -239,6 +239,7 @@ _ALL = (
         camera=_chang_camera,
         sources={
             "lens": "a single element with chromatic aberration: abstract; TiDy-PSFs, results",
+            "shape": "guess: plano-convex, convex towards the scene, 3 mm thick; for lens='own' only",
             "focal length": "guess: 50 mm; no code, and the paper's numbers could not be read",
             "aperture": "guess: f/8",
             "focus": "guess: 1.67 m, the middle of the depths in dioptres",
@@ -296,6 +297,8 @@ _ALL = (
         camera=_sitzmann_camera,
         sources={
             "focal length": "34.3 mm: a sensor 35.5 mm behind the plate, which is also the lens: code",
+            "shape": "plano-convex with a radius of (n - 1) focal lengths: code; for lens='own' only",
+            "thickness": "guess: 3 mm, convex towards the scene; for lens='own' only",
             "aperture": "5.00 mm: 1356 samples of 3.69 um: code",
             "focus": "1 m, that of the initial plate: code",
             "depth": "0.5 to 1000 m: code",

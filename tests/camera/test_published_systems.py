@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.camera.published_systems import cubic_in_zernikes
+from kornia_tidy import DefocusRange, Fidelity, NoMask, PixelwiseMask, TiDyOptics
+from kornia_tidy.camera.published_systems import cubic_in_zernikes, single_element
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.design.fisher_information import crlb
 from kornia_tidy.figures.system_statistics import contrast_transfer
@@ -342,3 +342,40 @@ class TestFromPreset(BaseTester):
         assert all(published_system(name).name == name for name in NAMES)
         assert len(NAMES) == 9
         assert [SYSTEMS[name].year for name in NAMES] == [2023, 2023, 2023, 2019, 2021, 2019, 2022, 2022, 2018]
+
+
+class TestSingleElement(BaseTester):
+    @pytest.mark.parametrize("name", ["chang2019", "sitzmann2018"])
+    def test_feature_astigmatism_and_field_curvature_are_those_of_a_thin_lens(self, name):
+        """With the stop in contact: S_III = H^2 / f and S_IV = S_III / n. The element is 3 mm thick: within a tenth."""
+        lens, camera = single_element(SYSTEMS[name]), SYSTEMS[name].camera()
+        heights = torch.tensor([0.0, 5e-3], dtype=torch.float64)
+        axis, corner = lens.sample(heights, torch.zeros(1, dtype=torch.float64), 530e-9).wavefront[:, 0]
+        invariant = camera.aperture_radius * 5e-3 / float(camera.image_distance)
+        third = invariant**2 / camera.focal_length * 2 * math.pi / 530e-9  # S_III in radians
+        index = camera.lens_material.index(530e-9)
+        assert float(corner[3]) == pytest.approx(-third / 4 / math.sqrt(6), rel=0.1)  # of sqrt(6) rho^2 cos 2 phi
+        curvature = -third / 4 * (2 + 1 / index)  # of rho^2, of both
+        assert float(corner[2] - axis[2]) == pytest.approx(curvature / (2 * math.sqrt(3)), rel=0.1)
+
+    @pytest.mark.parametrize("name", ["chang2019", "sitzmann2018"])
+    def test_feature_colours_lie_as_far_apart_in_focus_as_by_the_material(self, name):
+        given = {"masks": NoMask(46), "fidelity": "draft", "sensor": None}
+        real, ideal = preset(name, lens="own", **given), preset(name, **given)
+        foci = [torch.tensor([sharpest(optics, range(-20, 22), c) for c in (0, 1, 2)]) for optics in (real, ideal)]
+        apart = [(own - own[1]).double() for own in foci]
+        self.assert_close(apart[0], apart[1], rtol=0, atol=1.0)
+        assert float(apart[1].abs().max()) > 5
+
+    def test_feature_it_is_the_camera_of_the_system_in_all_else(self):
+        real, ideal = preset("chang2019", lens="own"), preset("chang2019")
+        assert real.lens.name == "chang2019"
+        assert real.camera.lens_material is None
+        for name in ("focal_length", "f_number", "focus_distance", "pixel_pitch", "depth_range", "defocus_range"):
+            assert getattr(real.camera, name) == pytest.approx(getattr(ideal.camera, name), rel=1e-6)
+        image, depth = torch.rand(1, 3, 24, 24), torch.full((1, 1, 24, 24), 2.0)
+        assert bool(real(image, depth).isfinite().all())
+
+    def test_exception_a_system_that_is_no_single_element(self):
+        with pytest.raises(ValueError, match="the single elements chang2019 and sitzmann2018, got 'tidy-5'"):
+            preset("tidy-5", lens="own")
