@@ -247,22 +247,22 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     check_float_tensor("nodes", nodes, 1, "(D,)")
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    even, spacing = False, nodes.new_ones(())
+    spacing: Tensor | None = None  # of nodes that are evenly spaced
     if nodes.device.type == "cpu" and len(nodes) > 1 and not (nodes.requires_grad or Mode.TRANSFORM in torch_mode()):
         # Between evenly spaced nodes there is nothing to search, which takes ten times as long.
-        spacing, rounding = (nodes[-1] - nodes[0]) / (len(nodes) - 1), 4 * torch.finfo(dtype).eps * nodes.abs().max()
-        apart = (nodes - (nodes[0] + spacing * torch.arange(len(nodes), dtype=dtype))).abs()
-        even = bool(((apart <= rounding) & (spacing > 2 * rounding)).all())
-    if nodes.device.type == "cpu" and not even:
+        step, rounding = (nodes[-1] - nodes[0]) / (len(nodes) - 1), 4 * torch.finfo(dtype).eps * nodes.abs().max()
+        apart = (nodes - (nodes[0] + step * torch.arange(len(nodes), dtype=dtype))).abs()
+        spacing = step if bool(((apart <= rounding) & (step > 2 * rounding)).all()) else None
+    if nodes.device.type == "cpu" and spacing is None:
         check_nodes(nodes)
-    if mode == "nearest" and even:
+    if mode == "nearest" and spacing is not None:
         steps = (defocus.detach() - nodes[0]).div_(spacing).sub_(0.5).ceil_().clamp_(0, len(nodes) - 1)
         return steps.long(), torch.zeros((), dtype=dtype).expand(defocus.shape)
     if mode == "nearest" or len(nodes) == 1:
         middles = (nodes[1:] + nodes[:-1]) / 2
         index = torch.bucketize(defocus.detach().contiguous(), middles.detach())
         return index, torch.zeros((), dtype=dtype, device=defocus.device).expand(defocus.shape)
-    if even:
+    if spacing is not None:
         steps = (defocus - nodes[0]).div_(spacing).clamp_(0, len(nodes) - 1)
         index = steps.detach().long().clamp_(max=len(nodes) - 2)
         return index, steps - index

@@ -20,7 +20,7 @@ from kornia_tidy.lab.raw.color import (
 )
 from tests.base import BaseTester
 
-with warnings.catch_warnings():
+with warnings.catch_warnings(), np.printoptions():  # importing colour sets NumPy's print options
     warnings.simplefilter("ignore")
     import colour
 
