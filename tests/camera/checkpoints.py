@@ -40,6 +40,7 @@ from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import build_head, build_optics, load_trained
 
 FOLDER = Path(__file__).parent / "checkpoints"
+RETIRED = Path(__file__).parents[2] / "examples" / "paper" / "systems"  # systems that are no longer shipped
 SIDE = 32  # pixels of the scene
 SYSTEM, BANK = "system.safetensors", "bank.safetensors"
 OTHERS = "captures.safetensors"  # by these two and by the shipped systems
@@ -158,11 +159,13 @@ def system() -> dict[str, Any]:
 
 
 def other_cameras(folder: Path) -> Iterator[tuple[str, TiDyOptics]]:
-    """Yield the cameras of a trained system's file, of measured PSFs' and of the shipped systems, by name."""
+    """Yield the cameras of a trained system's file, of measured PSFs' and of systems that are or were shipped, by name."""
     yield "system", load_trained(folder / SYSTEM).optics
     yield "bank", small().with_bank(PSFBank.load(folder / BANK))
-    for name in PRETRAINED:
-        optics = load_pretrained(name).optics
+    systems = {path.stem: load_trained(path) for path in sorted(RETIRED.glob("*.safetensors"))}
+    systems |= {name: load_pretrained(name) for name in PRETRAINED}
+    for name, trained in systems.items():
+        optics = trained.optics
         optics.border = "replicate"  # for a scene that is smaller than their PSFs
         yield name, optics
 

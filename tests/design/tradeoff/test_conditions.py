@@ -118,7 +118,7 @@ class TestConditions(BaseTester):
             "design/tradeoff/files",
             "design/tradeoff/__init__",
         }
-        elsewhere |= {"choices", "settings", "lazy", "version", "signals", "search_path", "design/__init__"}
+        elsewhere |= {"choices", "seeds", "settings", "lazy", "version", "signals", "search_path", "design/__init__"}
         names = {
             name.partition(".")[2].replace(".", "/") for name in done.stdout.split() if name.startswith("kornia_tidy.")
         }
