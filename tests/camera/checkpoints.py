@@ -159,7 +159,7 @@ def system() -> dict[str, Any]:
 
 
 def other_cameras(folder: Path) -> Iterator[tuple[str, TiDyOptics]]:
-    """Yield the cameras of a trained system's file, of measured PSFs' and of systems that are or were shipped, by name."""
+    """Yield cameras by name: of a trained system's file, of measured PSFs, of systems that are or were shipped."""
     yield "system", load_trained(folder / SYSTEM).optics
     yield "bank", small().with_bank(PSFBank.load(folder / BANK))
     systems = {path.stem: load_trained(path) for path in sorted(RETIRED.glob("*.safetensors"))}
