@@ -115,7 +115,7 @@ def run(path: Path, most: int | None, named: str) -> None:
     for cell in tqdm(todo, desc="cells"):
         weight = WEIGHTS[cell.matters]
         task = DesignTask(
-            RANGES[cell.depths],
+            depth_range=RANGES[cell.depths],
             electrons=cell.electrons,
             masks=cell.masks,
             depth_weight=weight,
