@@ -78,7 +78,8 @@ class Pupil:
 
     def cut_by_a_lens(self, amplitude: Tensor) -> Pupil:
         """Return this pupil with a learnt amplitude (n, n), not scaled to one light: a lens's stop cuts it too."""
-        pupil, transmission = copy.copy(self), amplitude.double().square()
+        pupil = copy.copy(self)
+        transmission = amplitude.double().square()
         light = float(transmission.detach().sum()) * self.cell_pitch**2
         vars(pupil).update(amplitude=amplitude, transmission=transmission.cpu(), light=light)
         return pupil
