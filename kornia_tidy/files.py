@@ -245,7 +245,7 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
         replace: whether an existing folder is replaced as a whole.
 
     Raises:
-        FileExistsError: if the path exists and is not to be replaced.
+        FileExistsError: if the path exists and is not to be replaced, or another process writes it at the same time.
         FileNotFoundError: if the parent folder does not exist.
     """
     path = Path(path).absolute()
@@ -260,14 +260,19 @@ def write_folder(path: str | os.PathLike[str], files: Mapping[str, bytes], repla
             new.mkdir()
             for name, data in files.items():
                 (new / name).write_bytes(data)
+            faster = f"cannot write {path}: another process has written it meanwhile"
             if path.exists():
+                if not replace:
+                    raise FileExistsError(faster)
                 path.rename(old)
             try:
                 new.rename(path)
                 needed = False
             except OSError as error:
                 needed = error.errno not in {errno.ENOTEMPTY, errno.EEXIST}  # else another writer was faster
-                if needed and old.exists():
+                if not needed:
+                    raise FileExistsError(faster) from error
+                if old.exists():
                     old.rename(path)
                 raise
     finally:

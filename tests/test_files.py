@@ -84,6 +84,17 @@ class TestWriting(BaseTester):
         assert (tmp_path / "out.png").read_bytes() == b"before"
         assert os.listdir(tmp_path) == ["out.png"]
 
+    def test_exception_a_folder_that_another_process_writes_meanwhile_is_its(self, tmp_path):
+        class Slow(dict):
+            def items(self):  # between the look for a folder and the renaming
+                write_folder(tmp_path / "capture", {"a": b"first"})
+                return super().items()
+
+        with pytest.raises(FileExistsError, match=r"^cannot write .*capture: another process has written it"):
+            write_folder(tmp_path / "capture", Slow(a=b"second"))
+        assert os.listdir(tmp_path) == ["capture"]
+        assert (tmp_path / "capture" / "a").read_bytes() == b"first"
+
 
 class TestOnlyHere(BaseTester):
     def test_exception_the_second_is_refused_and_the_folder_given_back(self, tmp_path):
