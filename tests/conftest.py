@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -46,3 +47,12 @@ def _seed(request: pytest.FixtureRequest) -> None:
     torch.manual_seed(0)
     if "dynamo" in request.node.name:
         torch.compiler.reset()  # compilations of other tests would affect its guesses of dynamic shapes
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """One thread, because threads do not live on in a fork."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

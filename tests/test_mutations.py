@@ -8,7 +8,6 @@ import time
 
 import numpy as np
 import pytest
-import torch
 
 from tests.base import BaseTester
 from tests.mutations import reading
@@ -18,6 +17,7 @@ from tests.mutations.pristine import Case, make_cases
 from tests.mutations.readers import SHARES, make_readers
 from tests.mutations.reading import damaged_case, read_all, shared_out
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 KINDS = (
     "npy",
     "npz",
@@ -42,15 +42,6 @@ def cases(tmp_path_factory):
 @pytest.fixture(scope="module")
 def readers(tmp_path_factory):
     return make_readers(tmp_path_factory.mktemp("readers"))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Threads do not live on in a fork."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 class TestMutations(BaseTester):

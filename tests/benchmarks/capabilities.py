@@ -20,10 +20,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
-from kornia_tidy import TiDyOptics
+from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.render.compositing import render
-from tests.benchmarks import ordinary_lenses
-from tests.benchmarks.compiled_captures import depth_of
 from tests.benchmarks.rendering_against_peers import (
     by_kornia,
     by_one_conv2d,
@@ -39,7 +37,7 @@ from tests.render.scenes import Bank
 ROUNDS = 3
 FRAMES, SIDE = 64, 256  # of a video
 SMALL, MANY = 64, 256  # px of small images, and their number
-LENS = "f/1.8 at 2 m"
+F_NUMBER, FOCUS = 1.8, 2.0  # m; of the lens without a mask
 
 
 class Row(NamedTuple):
@@ -128,17 +126,20 @@ def large_windows(image: Tensor, psi: Tensor) -> Iterator[Row]:
         )
 
 
-def ordinary_lens(*_: Tensor) -> Iterator[Row]:
-    """A 50 mm lens without a mask, its PSFs computed anew."""
-    image, depth = ordinary_lenses.scene(512, 2.0)
-    f_number, focus = ordinary_lenses.LENSES[LENS]
+def ordinary_lens(image: Tensor, psi: Tensor) -> Iterator[Row]:
+    """A 50 mm lens without a mask, its PSFs computed anew, before the middle of Aloe at 1.5 to 21 m."""
+    image, psi = (x[..., 200:712, 300:812] for x in (image, psi))
+    near = (psi - psi.min()) / (psi.max() - psi.min())
+    depth = 1 / (1 / 21 + (1 / 1.5 - 1 / 21) * near)
 
-    def ours() -> Tensor:
-        return ordinary_lenses.camera(f_number, focus).requires_grad_(False)(image, depth)
+    def camera() -> TiDyOptics:
+        lens = ThinLensCamera(50e-3, 50e-3 / F_NUMBER, FOCUS, 6e-6)
+        masks = PixelwiseMask(1, initial="flat").requires_grad_(False)
+        return TiDyOptics(masks, lens, sensor=None, color_space="linear")
 
-    optics = ordinary_lenses.camera(f_number, focus)
+    optics = camera()
     peers = {"discs of geometric optics by cv2.filter2D": lambda: by_discs(image, depth, optics)}
-    yield Row(f"50 mm {LENS}, 512 x 512, with its PSFs", ours, peers)
+    yield Row(f"50 mm f/{F_NUMBER} at {FOCUS:g} m, 512 x 512, with its PSFs", lambda: camera()(image, depth), peers)
 
 
 def batches(image: Tensor, psi: Tensor) -> Iterator[Row]:
@@ -146,7 +147,7 @@ def batches(image: Tensor, psi: Tensor) -> Iterator[Row]:
     optics = TiDyOptics(sensor=None)
     corners = [(100 * i, 120 * i) for i in range(8)]
     images, maps = (torch.cat([x[..., t : t + 278, left : left + 278] for t, left in corners]) for x in (image, psi))
-    depth = depth_of(maps, optics)
+    depth = optics.camera.depth(maps)
 
     def step(*parts: slice) -> None:
         for part in parts:
@@ -163,7 +164,7 @@ def batches(image: Tensor, psi: Tensor) -> Iterator[Row]:
 def videos(image: Tensor, psi: Tensor) -> Iterator[Row]:
     """64 frames with one bank of PSFs."""
     optics = TiDyOptics(sensor=None).requires_grad_(False)
-    depth = depth_of(psi, optics)
+    depth = optics.camera.depth(psi)
     frames = [(image[..., t : t + SIDE, t : t + SIDE], depth[..., t : t + SIDE, t : t + SIDE]) for t in range(FRAMES)]
 
     def film(*, anew: bool) -> None:
@@ -179,7 +180,7 @@ def videos(image: Tensor, psi: Tensor) -> Iterator[Row]:
 def small_images(image: Tensor, psi: Tensor) -> Iterator[Row]:
     """As many pixels in small images as in one of 1024 x 1024."""
     optics = TiDyOptics(sensor=None).requires_grad_(False)
-    whole = [x[..., :1024, :1024].contiguous() for x in (image, depth_of(psi, optics))]
+    whole = [x[..., :1024, :1024].contiguous() for x in (image, optics.camera.depth(psi))]
     side = 1024 // SMALL
     cut = [
         x.reshape(x.shape[1], side, SMALL, side, SMALL).permute(1, 3, 0, 2, 4).reshape(MANY, -1, SMALL, SMALL)

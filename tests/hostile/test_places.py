@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.data import read_image, write_depth, write_image
@@ -21,6 +20,7 @@ from tests.forks import fork, wait
 from tests.hostile.limited import apart, command, drop_rights, limit_files
 from tests.lab.raw.dng import dng
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 NAMES = (
     "with blanks  in it.png", "Übermaß 图像 🎉.png", "e\u0301.png", "a\nb\tc.png", "a'b\"c$(d)*?[e].png",
     "a" * 251 + ".png", os.fsdecode(b"not-utf-8-\xff.png"), "-leading.png", ".hidden.png", "..png",
@@ -53,15 +53,6 @@ def folder(tmp_path):
     write_heights(place / "masks.npy", PixelwiseMask(1).heights().detach())
     (place / "in.dng").write_bytes(dng(np.random.default_rng(0).integers(64, 999, (32, 48)).astype(np.uint16)))
     return place
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Threads do not live on in a fork."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def refused(outcome):

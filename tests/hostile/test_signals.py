@@ -19,7 +19,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 
 from kornia_tidy.cli import command_line
 from kornia_tidy.files import replacing
@@ -29,20 +28,12 @@ from tests.forks import fork, wait
 from tests.hostile.limited import apart, command
 from tests.training.coded_datasets.samples import contents
 
+pytestmark = pytest.mark.usefixtures("one_thread")
 RENDER = ("render", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--masks", "1", "--fidelity", "draft")
 TRAIN = ("train", "--resume", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--validation-scenes", "2",
          "--epochs", "2", "--masks", "1", "--width", "4", "--batch", "2", "--save-every", "1")  # fmt: skip
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 WORD = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-
-
-@pytest.fixture(autouse=True)
-def _one_thread():
-    """Threads do not live on in a fork."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def send_after(number, seconds):
