@@ -12,7 +12,6 @@ import torch
 from kornia_tidy.cli import main
 from kornia_tidy.data import NYUDepthV2, TUMSequence, described_folder
 from kornia_tidy.data.calibration_files import read_calibration
-from kornia_tidy.design.tradeoff import read_csv, write_csv
 from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.files import read_text
 from kornia_tidy.lab.calibration.noise.photon_transfer import read_json as read_noise
@@ -23,7 +22,6 @@ from kornia_tidy.training.coded_datasets.index import read_index
 from kornia_tidy.training.record import training_record
 from tests.base import BaseTester
 from tests.data.published import write_nyu
-from tests.design.tradeoff.samples import ROW
 
 FORMS = ("utf-8-sig", "utf-16", "utf-32", "utf-16-be with mark")
 CALIB = "cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n"
@@ -87,11 +85,6 @@ def _log(folder):
     return [path], kept
 
 
-def _sweep(folder):
-    write_csv(folder / "trade.csv", [ROW])
-    return [folder / "trade.csv"], lambda: read_csv(folder / "trade.csv")
-
-
 def _index(folder):
     (folder / "index.csv").write_text("key,name,coded\n000000,a,a.png\n")
     return [folder / "index.csv"], lambda: read_index(folder)
@@ -134,7 +127,6 @@ KINDS = (
     _validation,
     _curve,
     _log,
-    _sweep,
     _index,
     _noise,
     _frames,

@@ -8,23 +8,18 @@ and :func:`~kornia_tidy.design.verdict.decide` chooses one.
 from __future__ import annotations
 
 import math
-import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.design.candidates import DEPTH_FOCI, FOCI, STARTS, Candidate, coded_candidate, flat_candidate
-from kornia_tidy.design.design_memory import DesignMemory
 from kornia_tidy.design.design_task import DesignTask
-from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes, progress_over, score_candidate
+from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes, score_candidate
 from kornia_tidy.design.verdict import Finalist, Verdict, decide, finalist, in_words
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics.thin_lens import FASTEST
-from kornia_tidy.psf.camera_settings import digest_of, settings_of
 
 STOP = 2**0.5
 FOCUS_STEP = 0.1  # of the range of inverse depth
@@ -95,7 +90,6 @@ def co_design(
     scenes: Sequence[Scene] | None = None,
     effort: Effort | None = None,
     seed: int = 0,
-    progress_file: str | os.PathLike[str] | None = None,
     progress: Callable[[str, int], None] | None = None,
 ) -> CoDesign:
     """Design aperture, focus and masks of a camera together, and decide whether the masks pay.
@@ -106,8 +100,6 @@ def co_design(
             are moved to its ends. Half of all scenes choose the settings, the other half decide.
         effort: extent of the search. Default: :class:`Effort`.
         seed: of starts, scenes and noise. The same seed gives the same result on the same machine.
-        progress_file: keeps designed masks and scores as JSON, so that an interrupted design goes on where it stopped.
-            A file of another task, effort, seed or other scenes is replaced. Default: nothing is kept.
         progress: called with the name of each stage and the units of work done in it, see :func:`planned_work`.
 
     Returns:
@@ -137,19 +129,15 @@ def co_design(
     tell = (lambda stage, amount: None) if progress is None else progress
     given = [*(scenes or ())]
     _check_scenes(given, effort)
-    memory = DesignMemory(progress_file, _about(task, effort, seed, given))
-
-    candidates = _search(task, effort, seed, memory, tell)
+    candidates = _search(task, effort, seed, tell)
     taken = _finalists(task, candidates)
     pictures = [*leaf_scenes(effort.scenes, effort.size, task.depth_range, seed), *given]
     finalists = []
     for candidate in taken:
-        scores = memory.scores(
-            candidate,
-            lambda candidate=candidate: progress_over(
-                score_candidate(task, candidate, pictures, seed), lambda: tell("captures", 1)
-            ),
-        )
+        scores = []
+        for score in score_candidate(task, candidate, pictures, seed):
+            scores.append(score)
+            tell("captures", 1)
         finalists.append(finalist(task, candidate, scores))
     verdict = decide(finalists)
     return CoDesign(task, tuple(candidates), tuple(finalists), verdict, in_words(task, verdict))
@@ -167,40 +155,13 @@ def planned_work(task: DesignTask, effort: Effort, scenes: int = 0) -> dict[str,
     return {"search": steps, "captures": (len(FLAT_FINALISTS) + len(CODED_FINALISTS)) * (effort.scenes + scenes)}
 
 
-def expected_in_words(task: DesignTask, effort: Effort, work: dict[str, int]) -> str:
-    """Return the work of :func:`planned_work` and its time in words, from a few steps and one capture."""
-    f_number = task.f_numbers()[1]
-    times = []
-    for steps in (1, 3):  # the first step also computes values that the others need
-        start = time.perf_counter()
-        coded_candidate(task, "focal sweep", f_number, 0.5, steps)
-        times.append(time.perf_counter() - start)
-    step = times[1] / 4
-    scenes = leaf_scenes(2, effort.size, task.depth_range)
-    start = time.perf_counter()
-    list(score_candidate(task, flat_candidate(task, task.balanced_f_number, 0.5), scenes))
-    seconds = work["search"] * step + work["captures"] * (time.perf_counter() - start) / 2
-    told = f"{seconds:.0f} s" if seconds < 100 else f"{math.ceil(seconds / 60)} minutes"
-    return f"{work['search']} gradient steps and {work['captures']} captures, about {told}"
-
-
-def _search(
-    task: DesignTask, effort: Effort, seed: int, memory: DesignMemory, tell: Callable[[str, int], None]
-) -> list[Candidate]:
+def _search(task: DesignTask, effort: Effort, seed: int, tell: Callable[[str, int], None]) -> list[Candidate]:
     """Return flat lenses and masks on the coarse grid, then on the fine grids around the best of both."""
     found: list[Candidate] = []
 
     def coded(start: str, f_number: float, focus: float, steps: int) -> Candidate:
-        before = len(memory)
-        key = f"{start} f/{f_number:.9g} at {focus:.9g}, {steps} steps"
-        candidate = memory.candidate(
-            key,
-            lambda: coded_candidate(task, start, f_number, focus, steps, seed, lambda: tell("search", 1)),
-        )
-        if len(memory) == before:
-            tell("search", steps)
-        found.append(candidate)
-        return candidate
+        found.append(coded_candidate(task, start, f_number, focus, steps, seed, lambda: tell("search", 1)))
+        return found[-1]
 
     def flat(f_number: float) -> Candidate:
         lenses = [flat_candidate(task, f_number, focus) for focus in (DEPTH_FOCI if task.depth_weight else FOCI)]
@@ -262,14 +223,6 @@ def _around(candidates: list[Candidate], factors: Sequence[float]) -> list[Candi
         for near in [min(candidates, key=lambda one: abs(one.f_number / best.f_number / factor - 1))]
     }
     return sorted(chosen.values(), key=lambda one: one.f_number)
-
-
-def _about(task: DesignTask, effort: Effort, seed: int, scenes: Sequence[Scene]) -> dict[str, Any]:
-    """Return the key of a progress file as plain data."""
-    pictures = [digest_of(scene.image, scene.depth) for scene in scenes]
-    weights = digest_of(*task.modulator.parameters())  # settings hold none
-    about = {"task": settings_of(task), "modulator": weights, "effort": settings_of(effort)}
-    return {**about, "seed": seed, "scenes": pictures}
 
 
 def _check_scenes(scenes: Sequence[Scene], effort: Effort) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 import torch
@@ -132,12 +132,3 @@ def _normalised_inverse(depth: Tensor, depth_range: tuple[float, float]) -> Tens
 def _decibels(error: Tensor, valid: Tensor) -> float:
     squared = (error.square() * valid).sum() / valid.sum().clamp(min=1)
     return -10 * math.log10(max(float(squared), 1e-12))
-
-
-def progress_over(scores: Iterable[Scores], each: Callable[[], None]) -> list[Scores]:
-    """Return all scores, calling a function after each, for a progress bar."""
-    listed = []
-    for score in scores:
-        listed.append(score)
-        each()
-    return listed

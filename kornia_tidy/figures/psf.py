@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-from torch import Tensor
 
 from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, open_chart, require_matplotlib
 
@@ -14,38 +10,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from kornia_tidy.figures.psf_measures import PSFMeasures
+
 HEADLINE, LABEL, SMALL = 13, 8.5, 7.5  # pt
 CELL, MARGIN, PLOTS = 1.25, 0.75, 3.0  # inches
 
 
-@dataclass(frozen=True)
-class PSFSheet:
-    """PSFs and transfer functions to draw, for D depths from near to far, C channels and PSFs of P x P pixels.
-
-    Args:
-        title: name of the camera.
-        depths: D labels, such as ``"0.6 m"``.
-        channels: C labels, such as ``"530 nm"``.
-        psfs: (D, C, P, P), share of a point's light in each pixel.
-        contrast: (D, F) MTF of the middle channel, in rings of equal width from 0 to 0.5 cycles per pixel.
-        focus: (S,) defocus in radians, ascending.
-        slices: (S, P) middle row of the middle channel's PSF at each value of ``focus``.
-    """
-
-    title: str
-    depths: Sequence[str]
-    channels: Sequence[str]
-    psfs: Tensor
-    contrast: Tensor
-    focus: Tensor
-    slices: Tensor
-
-
-def draw_psfs(sheet: PSFSheet) -> Figure:
+def draw_psfs(measured: PSFMeasures, title: str) -> Figure:
     """Draw a montage of PSFs, and below it the slice through focus and the modulation transfer function.
 
     Args:
-        sheet: PSFs and transfer functions.
+        measured: PSFs and transfer functions.
+        title: heading of the figure.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)`` makes it some 1600 pixels wide for seven depths.
@@ -60,22 +36,22 @@ def draw_psfs(sheet: PSFSheet) -> Figure:
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    columns, rows = sheet.psfs.shape[:2]
+    columns, rows = measured.psfs.shape[:2]
     width, height = max(8.5, CELL * columns + 2 * MARGIN + 0.5), CELL * rows + PLOTS + 1.65
     figure = Figure(figsize=(width, height), facecolor="white")
-    figure.text(0.25 / width, 1 - 0.35 / height, sheet.title, fontsize=HEADLINE, color=INK, weight="bold")
-    _montage(figure, sheet)
+    figure.text(0.25 / width, 1 - 0.35 / height, title, fontsize=HEADLINE, color=INK, weight="bold")
+    _montage(figure, measured)
     bottom, tall = 0.6 / height, (PLOTS - 0.4) / height
-    _slice(figure.add_axes((MARGIN / width, bottom, 0.36, tall)), sheet)
-    _transfer(figure.add_axes((0.58, bottom, 0.38, tall)), sheet)
+    _slice(figure.add_axes((MARGIN / width, bottom, 0.36, tall)), measured)
+    _transfer(figure.add_axes((0.58, bottom, 0.38, tall)), measured)
     return figure
 
 
-def _montage(figure: Figure, sheet: PSFSheet) -> None:
+def _montage(figure: Figure, measured: PSFMeasures) -> None:
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.colors import PowerNorm  # noqa: PLC0415
 
-    (columns, rows), side = sheet.psfs.shape[:2], sheet.psfs.shape[-1]
+    (columns, rows), side = measured.psfs.shape[:2], measured.psfs.shape[-1]
     width, height, head = figure.get_figwidth(), figure.get_figheight(), 0.85
     left, right, top, bottom = MARGIN / width, 1 - 1 / width, 1 - head / height, 1 - (head + CELL * rows) / height
     grid = figure.add_gridspec(rows, columns, left=left, right=right, top=top, bottom=bottom, wspace=0.05, hspace=0.05)
@@ -83,13 +59,15 @@ def _montage(figure: Figure, sheet: PSFSheet) -> None:
     for row in range(rows):
         for column in range(columns):
             axes = figure.add_subplot(grid[row, column])
-            light = sheet.psfs[column, row].clamp(min=0)
+            light = measured.psfs[column, row].clamp(min=0)
             axes.imshow((light / light.amax()).numpy(), cmap=DEPTH_COLORS, norm=scale)
             axes.set(xticks=[], yticks=[])
             if row == 0:
-                axes.set_title(sheet.depths[column], fontsize=LABEL, color=INK)
+                axes.set_title(
+                    f"{measured.depths[column]}\n{_psi(measured.defocus[column])}", fontsize=LABEL, color=INK
+                )
             if column == 0:
-                axes.set_ylabel(sheet.channels[row], fontsize=LABEL, color=INK)
+                axes.set_ylabel(measured.channels[row], fontsize=LABEL, color=INK)
             cells.append(axes)
     length = max(1, round(side / 5))
     cells[0].plot([0.06 * side, 0.06 * side + length], [0.92 * side] * 2, color="white", linewidth=2)
@@ -100,14 +78,14 @@ def _montage(figure: Figure, sheet: PSFSheet) -> None:
     bar.ax.tick_params(labelsize=SMALL)
 
 
-def _slice(axes: Axes, sheet: PSFSheet) -> None:
+def _slice(axes: Axes, measured: PSFMeasures) -> None:
     from matplotlib.colors import PowerNorm  # noqa: PLC0415
 
-    half, percent = sheet.slices.shape[-1] / 2, 100 * sheet.slices.clamp(min=0).numpy()
-    extent = (-half, half, float(sheet.focus[0]), float(sheet.focus[-1]))
+    half, percent = measured.slices.shape[-1] / 2, 100 * measured.slices.clamp(min=0).numpy()
+    extent = (-half, half, float(measured.focus[0]), float(measured.focus[-1]))
     scale = PowerNorm(0.5, 0)
     light = axes.imshow(percent, origin="lower", aspect="auto", extent=extent, cmap=DEPTH_COLORS, norm=scale)
-    axes.set_title(f"Slice through focus, {_middle(sheet)}", fontsize=LABEL + 1, color=INK)
+    axes.set_title(f"Slice through focus, {_middle(measured)}", fontsize=LABEL + 1, color=INK)
     axes.set_xlabel("column from the chief ray, pixels", fontsize=LABEL, color=INK)
     axes.set_ylabel("defocus ψ, rad (near is up)", fontsize=LABEL, color=INK)
     axes.tick_params(labelsize=SMALL)
@@ -116,24 +94,29 @@ def _slice(axes: Axes, sheet: PSFSheet) -> None:
     bar.ax.tick_params(labelsize=SMALL)
 
 
-def _transfer(axes: Axes, sheet: PSFSheet) -> None:
+def _transfer(axes: Axes, measured: PSFMeasures) -> None:
     from matplotlib import colormaps  # noqa: PLC0415
 
-    frequency = [0, *ring_centres(sheet.contrast.shape[-1])]
-    for index, (label, curve) in enumerate(zip(sheet.depths, sheet.contrast, strict=True)):
-        color = colormaps["viridis"](0.9 * index / max(len(sheet.depths) - 1, 1))
-        axes.plot(frequency, [1, *curve.tolist()], color=color, linewidth=1.4, label=label.replace("\n", ", "))
+    frequency = [0, *ring_centres(measured.contrast.shape[-1])]
+    middle = measured.contrast[:, len(measured.channels) // 2]
+    for index, (depth, psi, curve) in enumerate(zip(measured.depths, measured.defocus, middle, strict=True)):
+        color = colormaps["viridis"](0.9 * index / max(len(measured.depths) - 1, 1))
+        axes.plot(frequency, [1, *curve.tolist()], color=color, linewidth=1.4, label=f"{depth}, {_psi(psi)}")
     axes.axhline(0.5, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set(xlim=(0, 0.5), ylim=(0, 1.02))
-    axes.set_title(f"Contrast (MTF), mean of all directions, {_middle(sheet)}", fontsize=LABEL + 1, color=INK)
+    axes.set_title(f"Contrast (MTF), mean of all directions, {_middle(measured)}", fontsize=LABEL + 1, color=INK)
     axes.set_xlabel("spatial frequency, cycles a pixel", fontsize=LABEL, color=INK)
     axes.set_ylabel("contrast", fontsize=LABEL, color=INK)
     open_chart(axes, SMALL)
     axes.legend(fontsize=SMALL, frameon=False, loc="upper right")
 
 
-def _middle(sheet: PSFSheet) -> str:
-    return sheet.channels[len(sheet.channels) // 2]
+def _psi(defocus: float) -> str:
+    return f"ψ = {defocus:+.3g}" if defocus else "ψ = 0"
+
+
+def _middle(measured: PSFMeasures) -> str:
+    return measured.channels[len(measured.channels) // 2]
 
 
 def ring_centres(frequencies: int) -> list[float]:

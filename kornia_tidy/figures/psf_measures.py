@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at
-from kornia_tidy.figures.psf import PSFSheet, ring_centres
+from kornia_tidy.figures.psf import ring_centres
 from kornia_tidy.figures.system_statistics import contrast_transfer
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -42,15 +42,6 @@ class PSFMeasures:
     contrast: Tensor
     focus: Tensor
     slices: Tensor
-
-    def sheet(self, title: str) -> PSFSheet:
-        """Return what :func:`~kornia_tidy.figures.psf.draw_psfs` draws."""
-        labels = [
-            f"{depth}\nψ = {psi:+.3g}" if psi else f"{depth}\nψ = 0"
-            for depth, psi in zip(self.depths, self.defocus, strict=True)
-        ]
-        contrast = self.contrast[:, len(self.channels) // 2]
-        return PSFSheet(title, labels, self.channels, self.psfs, contrast, self.focus, self.slices)
 
     def table(self) -> list[str]:
         """Return the numbers as lines of aligned columns, the headings first."""

@@ -180,9 +180,8 @@ def _titles(figure: Figure, run: TradeRun) -> None:
         f"along each thin line one setting changes"
     )
     figure.text(0.03, 0.9, about, fontsize=LABEL, color=FAINT)
-    code = f"kornia-tidy {here.version}" + (f" ({here.commit})" if here.commit else "")
     threads = f", {here.threads} thread{'s' if here.threads != 1 else ''}"
-    machine = f"{here.device}{threads}; PyTorch {here.torch}; {code}; {here.date[:10]}"
+    machine = f"{here.device}{threads}; PyTorch {here.torch}; kornia-tidy {here.version}; {here.date[:10]}"
     figure.text(0.03, 0.02, machine, fontsize=SMALL, color=FAINT)
 
 

@@ -24,18 +24,18 @@ COLORS = {
     "L": INK,
 }
 TITLE, LABEL, SMALL = 12, 9, 7.5  # pt
-WIDTH, HEIGHT = 10.5, 5.0  # inches
+WIDTH, HEIGHT = 8.5, 5.0  # inches
 STEPS = 400  # of a curve
 
 
 def draw_transfer(result: PhotonTransfer) -> Figure:
-    """Draw a photon-transfer calibration: points with two standard errors, and the fitted curve.
+    """Draw a photon-transfer calibration: noise over signal in electrons, its points and the fitted parts.
 
     Args:
         result: from :func:`~kornia_tidy.lab.calibration.noise.photon_transfer.photon_transfer` or a file.
 
     Returns:
-        A figure; ``figure.savefig(path, dpi=150)`` makes it 1575 pixels wide.
+        A figure; ``figure.savefig(path, dpi=150)`` makes it 1275 pixels wide.
 
     Raises:
         ImportError: if matplotlib is missing.
@@ -47,15 +47,12 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
-    straight = figure.add_axes((0.075, 0.125, 0.40, 0.665))
-    limits = figure.add_axes((0.575, 0.125, 0.40, 0.665))
+    axes = figure.add_axes((0.1, 0.125, 0.87, 0.665))
     top = max(point.level for point in result.points)
-    levels = np.concatenate([np.zeros(1), np.geomspace(top / 1e4, top, STEPS)])
-    _variance(straight, result, levels)
-    _noise(limits, result, levels[1:])
-    for axes in (straight, limits):
-        open_chart(axes, LABEL)
-        axes.legend(fontsize=SMALL, frameon=False, loc="upper left")
+    levels = np.geomspace(top / 1e4, top, STEPS)
+    _noise(axes, result, levels)
+    open_chart(axes, LABEL)
+    axes.legend(fontsize=SMALL, frameon=False, loc="upper left")
     _titles(figure, result)
     return figure
 
@@ -67,34 +64,6 @@ def _parts(result: PhotonTransfer, levels: np.ndarray) -> tuple[np.ndarray, np.n
     return dark, levels / line.gain, (line.fixed_pattern * levels) ** 2
 
 
-def _variance(axes: Axes, result: PhotonTransfer, levels: np.ndarray) -> None:
-    dark, shot, pattern = _parts(result, levels)
-    for name in dict.fromkeys(point.channel for point in result.points):
-        own = [point for point in result.points if point.channel == name]
-        axes.errorbar(
-            [point.level for point in own],
-            [point.variance for point in own],
-            [2 * point.variance * math.sqrt(2 / point.samples) for point in own],
-            linestyle="",
-            marker="o",
-            markersize=4,
-            markeredgecolor="white",
-            markeredgewidth=0.5,
-            elinewidth=0.9,
-            color=COLORS.get(name, INK),
-            label=name,
-            zorder=3,
-        )
-    axes.plot(levels, dark + shot, color=INK, linewidth=1.2, label="photon transfer", zorder=2)
-    if pattern.any():
-        axes.plot(levels, dark + shot + pattern, color=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
-        axes.lines[-1].set_label("with fixed pattern")
-    axes.set_xlim(0, 1.04 * levels[-1])
-    axes.set_ylim(0, 1.08 * max(point.variance for point in result.points))
-    axes.set_xlabel("level over black, counts", fontsize=LABEL, color=INK)
-    axes.set_ylabel("variance, counts²", fontsize=LABEL, color=INK)
-
-
 def _noise(axes: Axes, result: PhotonTransfer, levels: np.ndarray) -> None:
     gain = result.line.gain
     dark, shot, pattern = (gain * np.sqrt(part) for part in _parts(result, levels))
@@ -104,6 +73,7 @@ def _noise(axes: Axes, result: PhotonTransfer, levels: np.ndarray) -> None:
             [gain * point.level for point in own],
             [gain * math.sqrt(point.variance) for point in own],
             "o",
+            label=name,
             markersize=4,
             markeredgecolor="white",
             markeredgewidth=0.5,

@@ -4,7 +4,6 @@ import importlib
 import io
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +12,8 @@ from safetensors.torch import load
 
 from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.design import Candidate, DesignTask, Effort, co_design, planned_work
-from kornia_tidy.design.design_memory import DesignMemory
-from kornia_tidy.design.design_report import CAMERA, DATA, MASKS, REPORT, design_files
+from kornia_tidy.design import DesignTask, Effort, co_design, planned_work
+from kornia_tidy.design.design_report import CAMERA, DATA, MASKS, design_files
 from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
@@ -79,42 +77,6 @@ class TestCoDesign(BaseTester):
         assert done["search"] == planned["search"]
         assert done["captures"] == len(design.finalists) * TINY.scenes <= planned["captures"]
 
-    @pytest.mark.takes_seconds
-    def test_feature_goes_on_where_it_stopped_and_ends_alike(self, tmp_path, monkeypatch):
-        """Interrupted at the fifth finalist; then nothing is searched or captured twice."""
-        path, calls, captures_left = tmp_path / "progress.json", [], [4]
-
-        def searched(task, start, f_number, focus, steps, seed, each_step):
-            calls.append((start, f_number, focus, steps))
-            return Candidate(start, f_number, focus, 1 / f_number, math.nan, abs(f_number - 30), torch.ones(1, 3, 3))
-
-        def captured(task, candidate, scenes, seed):
-            if not captures_left[0]:
-                raise KeyboardInterrupt
-            captures_left[0] -= 1
-            calls.append((candidate.start, candidate.f_number))
-            return [{"image": {"only": candidate.f_number + number}} for number, _ in enumerate(scenes)]
-
-        monkeypatch.setattr(module, "coded_candidate", searched)
-        monkeypatch.setattr(module, "score_candidate", captured)
-        with pytest.raises(KeyboardInterrupt):
-            co_design(DIM, effort=TINY, progress_file=path)
-        before = len(calls)
-        captures_left[0] = 100
-        again = co_design(DIM, effort=TINY, progress_file=path)
-        assert len(calls) - before == len(again.finalists) - 4
-        assert len(set(calls)) == len(calls)
-        whole = co_design(DIM, effort=TINY)
-        assert [one.cost for one in again.candidates] == [one.cost for one in whole.candidates]
-        assert [one.scores for one in again.finalists] == [one.scores for one in whole.finalists]
-
-    def test_feature_progress_of_another_design_is_not_taken(self, tmp_path):
-        path = tmp_path / "progress.json"
-        memory = DesignMemory(path, {"seed": 1})
-        memory.scores(Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3)), lambda: [{}])
-        assert len(DesignMemory(path, {"seed": 1})) == 1
-        assert len(DesignMemory(path, {"seed": 2})) == 0
-
     def test_exception_scenes(self):
         scene = leaf_scenes(1, 96, (0.3, math.inf))[0]
         with pytest.raises(ValueError, match=r"scene 0 must be at least 97 pixels a side .*, got \(96, 96\)"):
@@ -141,16 +103,6 @@ class TestDesignFiles(BaseTester):
         assert (data["words"], data["gain_dB"]) == (design.words, design.verdict.gain)
         assert data["task"]["depth_range"] == [0.2975, None]
         assert len(data["candidates"]) == len(design.candidates)
-
-    def test_feature_the_report_says_the_verdict_and_lists_everything(self, dim):
-        report = design_files(dim)[REPORT].decode()
-        assert f"**{dim.words}**" in report
-        assert report.count("\n| ") == 2 + len(dim.finalists) + len(dim.candidates)
-        assert "electrons at f/" in report
-        assert "a wider aperture than any that was compared" in report
-        full = replace(dim, task=replace(dim.task, full_well=dim.task.electrons / 100))
-        assert "wider apertures are exposed for a shorter time" in design_files(full)[REPORT].decode()
-        assert all(len(line) < 200 for line in report.splitlines() if line.startswith("|"))
 
 
 class TestLeafScenes(BaseTester):

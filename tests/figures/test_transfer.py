@@ -16,15 +16,18 @@ RESULT = PhotonTransfer("Acme One", 100.0, "single", 512.0, 4095.0, LINE, {"R": 
 
 class TestDrawTransfer(BaseTester):
     def test_feature_all_points_and_the_line_are_drawn(self):
-        straight, limits = draw_transfer(RESULT).axes
-        drawn = [tuple(map(float, xy)) for c in straight.containers for xy in zip(*c[0].get_data(), strict=True)]
-        assert sorted(drawn) == sorted((point.level, point.variance) for point in POINTS)
-        lines = {line.get_label(): line for line in straight.lines}
-        level, variance = lines["photon transfer"].get_data()
-        assert variance == pytest.approx(level / 2 + 9 + 1 / 12)
-        _, bent = lines["with fixed pattern"].get_data()
-        assert bent - variance == pytest.approx((0.01 * level) ** 2)
-        assert (limits.get_xscale(), limits.get_yscale()) == ("log", "log")
+        (axes,) = draw_transfer(RESULT).axes
+        lines = {line.get_label(): line for line in axes.lines}
+        for name in "RG":
+            lit = [point for point in POINTS if point.level and point.channel == name]
+            levels, noises = lines[name].get_data()
+            assert levels == pytest.approx([2 * point.level for point in lit])
+            assert noises == pytest.approx([2 * point.variance**0.5 for point in lit])
+        electrons, noise = lines["together"].get_data()
+        counts = electrons / 2
+        assert noise**2 / 4 == pytest.approx(counts / 2 + 9 + 1 / 12 + (0.01 * counts) ** 2)
+        assert lines["fixed pattern"].get_data()[1] == pytest.approx(0.01 * electrons)
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
 
     def test_feature_says_the_numbers(self):
         words = " ".join(text.get_text() for text in draw_transfer(RESULT).texts)

@@ -49,12 +49,8 @@ FOUND = (
     ("index", "000000-000001.tar", lambda data: data[:700], "delete it to have it rendered again"),  # ReadError
     ("index", "000000-000001.tar", lambda data: data.replace(b"scene.json", b"other.json"), "delete it"),  # KeyError
     ("index", "sample.json", changed(index=float("inf")), "it has no scene.json of a capture"),  # OverflowError
-    ("trade", "trade.csv", last_line_cut, "more or fewer cells"),  # TypeError
-    ("trade", "trade.json", changed(format=LONG), "is not a readable sweep"),
     ("noise", "noise.json", changed(black=10**400, white=10**401), "is not a readable noise calibration"),
     ("noise", "noise.json", changed(**{LONG: 1}), "is not a readable noise calibration"),
-    ("design", "design.json", changed(entries=3), "entries must be values by name"),  # TypeError
-    ("design", "design.json", changed(entries={"a": {"start": 1}}), "a is no candidate"),  # KeyError
     ("figure", "validation.csv", lambda data: data + bytes(200_000), "cannot read .*validation.csv"),  # csv.Error
     ("figure", "validation.csv", lambda data: data.replace(b"psnr", b"pxnr"), "logs of the run in .* are damaged"),
     ("folder", "rgb.txt", lambda data: data.replace(b"a.png", LONG.encode() + b".png"), "the name is too long"),

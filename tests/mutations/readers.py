@@ -19,10 +19,6 @@ from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.picture_header import check_header
 from kornia_tidy.data.rgbd_folder import described_folder
-from kornia_tidy.design.candidates import Candidate
-from kornia_tidy.design.design_memory import DesignMemory
-from kornia_tidy.design.tradeoff import TradeRun
-from kornia_tidy.design.tradeoff import files as trade_files
 from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
 from kornia_tidy.lab.calibration.noise.photon_transfer import read_json as read_noise
@@ -48,7 +44,6 @@ from kornia_tidy.training.record import training_record
 from tests.data.published import write_nyu
 from tests.data.tiff_walk import cases as combinations
 from tests.data.tiff_walk import make as make_tiff
-from tests.design.tradeoff.samples import CONDITIONS, ROW
 from tests.lab.raw.dng import dng
 from tests.mutations.pristine import Case, make_cases
 
@@ -69,8 +64,6 @@ TIFFS = 150
 
 KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "pam", "bmp", "webp", "hdf5", "exr"}
 """Of pictures and depth."""
-
-CANDIDATE = Candidate("random", 20.0, 0.5, 0.02, 0.1, -17.0, torch.ones(1, 3, 3))
 
 
 def make_readers(folder: Path) -> dict[str, list[Case]]:
@@ -206,7 +199,7 @@ def _from_folder(path: Path) -> object:
 
 
 def _calibrations(folder: Path) -> list[Case]:
-    """Calibrations, noise profiles, trade-offs and design records."""
+    """Calibrations and noise profiles."""
     folder.mkdir()
     (folder / "calib.txt").write_text("cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n")
     (folder / "calib.json").write_text('{"focal_px": 3997.5, "baseline_m": 0.1935, "doffs_px": 131.25}')
@@ -215,21 +208,11 @@ def _calibrations(folder: Path) -> list[Case]:
     point = CurvePoint(**{name: "G" if "str" in str(names[name].type) else 2 for name in names})
     noise = PhotonTransfer("a", 100.0, "flats", 64.0, 4095.0, line, {"G": line}, (point,))
     write_json(folder / "noise.json", noise)
-    trade_files.write_json(folder / "trade.json", TradeRun(CONDITIONS, (ROW,)))
-    trade_files.write_csv(folder / "trade.csv", [ROW])
-    DesignMemory(folder / "design.json", {"f_number": 4}).candidate("a", lambda: CANDIDATE)
     return [
         Case("calibration", "text", folder / "calib.txt", read_calibration),
         Case("calibration", "json", folder / "calib.json", read_calibration),
         Case("noise", "json", folder / "noise.json", lambda path: read_noise(path).sensor_noise()),
-        Case("trade", "json", folder / "trade.json", trade_files.read_json),
-        Case("trade", "text", folder / "trade.csv", trade_files.read_csv),
-        Case("design", "json", folder / "design.json", _design),
     ]
-
-
-def _design(path: Path) -> object:
-    return DesignMemory(path, {"f_number": 4}).candidate("a", lambda: CANDIDATE)
 
 
 def _folders(folder: Path, made: dict[str, list[Case]]) -> list[Case]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.choices import BETWEEN
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from kornia_tidy.data.rgbd import Scene
     from kornia_tidy.design.co_design import CoDesign, Effort
     from kornia_tidy.design.design_task import DesignTask
-
-PROGRESS = "progress.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +85,12 @@ class Design:
     modulator: ModulatorSettings = field(default_factory=ModulatorSettings)
 
     notes: ClassVar = """\
-FOLDER gets report.md (read this first), design.png, report.json, masks.npy (heights of
-the best masks in metres) and camera.safetensors (the recommended camera):
+FOLDER gets design.png (look at this first), report.json (every camera that was compared),
+masks.npy (heights of the best masks in metres) and camera.safetensors (the recommended
+camera):
   kornia-tidy masks export FOLDER/camera.safetensors -o slm      frames for a modulator
   kornia-tidy psf FOLDER/camera.safetensors --aperture-diameter A --focus-distance Z
 its PSFs, with the aperture and the focus that are printed at the end.
-After Ctrl-C the same command goes on where it stopped (FOLDER/progress.json).
 
 How many electrons? The full well of the pixel if white nearly saturates it. Else roughly
   500 * illuminance in lux * exposure in seconds * (pixel pitch in um)^2 / f-number^2
@@ -127,44 +124,39 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
         folder = check_folder(self.output)
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.data.rgbd_folder import scenes_in
-        from kornia_tidy.design.co_design import Effort, expected_in_words, planned_work
-        from kornia_tidy.design.design_report import CAMERA, DATA, PICTURE, REPORT, exposure_in_words, focus_distance
-        from kornia_tidy.figures.style import require_matplotlib
-        from kornia_tidy.files import only_here
+        from kornia_tidy.design.co_design import Effort, planned_work
+        from kornia_tidy.design.design_report import PICTURE, design_files, exposure_in_words, focus_distance
+        from kornia_tidy.figures.co_design import draw_co_design
+        from kornia_tidy.figures.style import require_matplotlib, save_figure
+        from kornia_tidy.files import write_bytes
 
         require_matplotlib()
         task = self.task()
         effort = Effort.quick() if self.quick else Effort()
         scenes = [] if self.scenes is None else scenes_in(self.scenes)
         folder.mkdir(parents=True, exist_ok=True)
-        with only_here(folder, "a design is running"):
-            work = planned_work(task, effort, len(scenes))
-            near, far = task.depth_range
-            tell("scene", f"depths {near:g} to {far:g} m, {effort.scenes} dead leaves, {len(scenes)} scenes of yours")
-            tell(
-                "light", f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g}, equal exposure time"
-            )
-            tell("work", expected_in_words(task, effort, work) + _earlier(folder / PROGRESS))
-            design = _with_progress(task, scenes, effort, self.seed, folder / PROGRESS, work)
-            _write(folder, design)
+        work = planned_work(task, effort, len(scenes))
+        near, far = task.depth_range
+        tell("scene", f"depths {near:g} to {far:g} m, {effort.scenes} dead leaves, {len(scenes)} scenes of yours")
+        tell("light", f"{task.electrons:g} electrons of white at f/{task.reference_f_number:g}, equal exposure time")
+        tell("work", f"{work['search']} gradient steps and {work['captures']} captures")
+        design = _with_progress(task, scenes, effort, self.seed, work)
+        save_figure(folder / PICTURE, draw_co_design(design))
+        files = design_files(design)
+        for name, data in files.items():
+            write_bytes(folder / name, data)
         tell("verdict", design.words)
         focus, f_number = focus_distance(task, design.recommended), design.recommended.f_number
         tell("exposure", exposure_in_words(design))
         tell("camera", f"f/{f_number:.3g}, aperture {task.focal_length / f_number:.3g} m, focus at {focus:.3g} m")
-        tell("wrote", f"{folder / REPORT}: read this one")
-        for name in (PICTURE, DATA, "masks.npy", CAMERA):
+        tell("wrote", f"{folder / PICTURE}: look at this one")
+        for name in files:
             tell("", str(folder / name))
 
 
-def _earlier(progress_file: Path) -> str:
-    return f"; {progress_file} goes on, if it is of this design" if progress_file.exists() else ""
-
-
-def _with_progress(
-    task: DesignTask, scenes: list[Scene], effort: Effort, number: int, progress_file: Path, work: dict[str, int]
-) -> CoDesign:
+def _with_progress(task: DesignTask, scenes: list[Scene], effort: Effort, seed: int, work: dict[str, int]) -> CoDesign:
     """Run the co-design with a progress bar for each stage."""
-    from kornia_tidy.cli.commands.report import progress_bar, tell
+    from kornia_tidy.cli.commands.report import progress_bar
     from kornia_tidy.design.co_design import co_design
 
     bars: dict[str, Any] = {}
@@ -177,20 +169,7 @@ def _with_progress(
         bars[stage].update(amount)
 
     try:
-        return co_design(task, scenes, effort, number, progress_file, progress)
-    except KeyboardInterrupt:
-        tell("stopped", "the same command goes on from here")
-        raise
+        return co_design(task, scenes, effort, seed, progress)
     finally:
         for bar in bars.values():
             bar.close()
-
-
-def _write(folder: Path, design: CoDesign) -> None:
-    from kornia_tidy.design.design_report import PICTURE, design_files
-    from kornia_tidy.figures.co_design import draw_co_design
-    from kornia_tidy.figures.style import encoded_figure
-    from kornia_tidy.files import write_bytes
-
-    for name, data in {**design_files(design), PICTURE: encoded_figure(draw_co_design(design))}.items():
-        write_bytes(folder / name, data)

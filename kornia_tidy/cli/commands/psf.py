@@ -123,9 +123,9 @@ class Psf:
             with stages("PSFs"):
                 measured = measures_of_psfs(optics, psi)
             name = Path(self.camera or self.lens or "").name
-            sheet = measured.sheet(f"PSFs of {name}, window {optics.window} x {optics.window} px")
+            title = f"PSFs of {name}, window {optics.window} x {optics.window} px"
             with stages("picture"):
-                save_figure(self.output, draw_psfs(sheet))
+                save_figure(self.output, draw_psfs(measured, title))
         else:
             if optics.lens is None:
                 raise ValueError(f"--field is for a camera with a lens, and {self.camera} has none: give it --lens")

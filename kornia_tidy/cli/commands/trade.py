@@ -61,8 +61,7 @@ class Trade:
     )
     notes: ClassVar = """\
 Results are written to FOLDER/trade.json and trade.csv after every point, and at the end a
-figure to trade.png and a table to the screen. After Ctrl-C the same command continues.
-Another scene, machine or version of the code starts anew.
+figure to trade.png and a table to the screen.
 
 No setting can lower the error below that of the other settings. With an exact but slow
 base, --base reference, the error of each single setting is measured.
@@ -84,8 +83,8 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         from kornia_tidy.cli.commands.report import progress_bar, scene_in_words, tell
         from kornia_tidy.design.tradeoff.conditions import Conditions
         from kornia_tidy.design.tradeoff.costs import checked_device
-        from kornia_tidy.design.tradeoff.files import TradeRun, known_rows, markdown, rows_beside, write_trade
-        from kornia_tidy.design.tradeoff.measure import missing, scene_settings, sweep
+        from kornia_tidy.design.tradeoff.files import TradeRun, markdown, write_trade
+        from kornia_tidy.design.tradeoff.measure import scene_settings, sweep
         from kornia_tidy.figures.style import require_matplotlib, save_figure
         from kornia_tidy.figures.tradeoff import draw_trade
 
@@ -96,9 +95,8 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         image, depth = scene.image.to(device), scene.depth.to(device)
         optics.check_scene(image, depth)  # warns once: the measured captures do not warn
         name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
-        conditions = Conditions.here_and_now(name, optics, image, depth, self.reference)
+        conditions = Conditions.here_and_now(name, optics, image, self.reference)
         settings = scene_settings(optics, image, depth, self.base, self.knobs or KNOBS)
-        known, why = known_rows(folder, conditions)
 
         tell("scene", f"{name}, {scene_in_words(scene)}")
         tell("camera", optics.camera.extra_repr())
@@ -106,8 +104,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
             tell("lens", optics.lens.extra_repr())
         tell("masks", self.camera.in_words(optics))
         tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
-        todo = len(missing(settings, known, self.repeats, self.training))
-        tell("settings", f"{len(settings)}, {todo} different ones to be measured{why}")
+        tell("settings", str(len(settings)))
         folder.mkdir(parents=True, exist_ok=True)
 
         rows = []
@@ -119,26 +116,16 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
             repeats=self.repeats,
             training=self.training,
             reference=self.reference,
-            known=known,
         )
         with progress_bar("trade", total=len(settings), unit="setting") as progress:
-            try:
-                for setting in settings:
-                    step = f"{setting.knob} {setting.value}"
-                    progress.set_postfix_str(f"reference, then {step}" if todo and not rows else step)
-                    rows.append(next(steps))
-                    write_trade(folder, TradeRun(conditions, (*rows, *rows_beside(known, rows))))
-                    progress.update()
-            except KeyboardInterrupt:
-                progress.close()
-                tell(
-                    "stopped",
-                    f"{len(rows)} of {len(settings)} settings are written; the same command goes on from there",
-                )
-                raise
+            for setting in settings:
+                step = f"{setting.knob} {setting.value}"
+                progress.set_postfix_str(step if rows else f"reference, then {step}")
+                rows.append(next(steps))
+                write_trade(folder, TradeRun(conditions, tuple(rows)))
+                progress.update()
 
-        shown = TradeRun(conditions, tuple(rows))
-        save_figure(folder / "trade.png", draw_trade(shown))
+        save_figure(folder / "trade.png", draw_trade(TradeRun(conditions, tuple(rows))))
         print(f"\n{markdown(rows)}\n")
         tell("bold", "no other setting is both faster and closer to the reference")
         tell("wrote", f"{folder / 'trade.png'}: look at this one")

@@ -5,8 +5,8 @@ first; ``sweep_settings.py`` has the settings that are swept.
 """
 
 from kornia_tidy.design.tradeoff.conditions import Conditions
-from kornia_tidy.design.tradeoff.files import TradeRun, markdown, read_csv, read_json, write_csv, write_json
-from kornia_tidy.design.tradeoff.measure import TradeRow, capture, measure, missing, pareto, sweep
+from kornia_tidy.design.tradeoff.files import TradeRun, markdown, write_trade
+from kornia_tidy.design.tradeoff.measure import TradeRow, capture, measure, pareto, sweep
 from kornia_tidy.design.tradeoff.sweep_settings import (
     PLAN,
     PRESET,
@@ -29,13 +29,9 @@ __all__ = [
     "capture",
     "markdown",
     "measure",
-    "missing",
     "pareto",
     "planned",
-    "read_csv",
-    "read_json",
     "sweep",
     "sweep_settings",
-    "write_csv",
-    "write_json",
+    "write_trade",
 ]

@@ -99,7 +99,6 @@ def sweep(
     repeats: int = 5,
     training: bool = False,
     reference: str | Fidelity = "reference",
-    known: Iterable[TradeRow] = (),
 ) -> Iterator[TradeRow]:
     """Measure settings one after another, and yield each row when it is measured.
 
@@ -112,7 +111,6 @@ def sweep(
         repeats: timed runs of each.
         training: also measure captures with gradients.
         reference: the fidelity to which errors refer.
-        known: rows measured earlier under the same conditions; their settings are not measured again.
 
     Returns:
         Rows in the order of the settings. Equal settings with two names are measured once.
@@ -128,7 +126,7 @@ def sweep(
         >>> [(row.window, row.rmse > 0) for row in rows]
         [(9, True), (17, True)]
     """
-    measured = {_knobs(row.fidelity): row for row in known if _serves(row, repeats, training)}
+    measured: dict[Fidelity, TradeRow] = {}
     truth = None
     for setting in settings:
         key = _knobs(setting.fidelity)
@@ -136,16 +134,6 @@ def sweep(
             truth = capture(optics, image, depth, reference) if truth is None else truth
             measured[key] = measure(optics, image, depth, setting.fidelity, truth, repeats=repeats, training=training)
         yield replace(measured[key], **setting._asdict())
-
-
-def missing(settings: Iterable[Setting], known: Iterable[TradeRow], repeats: int, training: bool) -> set[Fidelity]:
-    """Return the settings that are not among the known rows, each once."""
-    served = {_knobs(row.fidelity) for row in known if _serves(row, repeats, training)}
-    return {_knobs(setting.fidelity) for setting in settings} - served
-
-
-def _serves(row: TradeRow, repeats: int, training: bool) -> bool:
-    return row.repeats >= repeats and not (training and row.training_seconds is None)
 
 
 def _knobs(fidelity: Fidelity) -> Fidelity:

@@ -28,7 +28,6 @@ ROW = TradeRow(
 
 CONDITIONS = Conditions(
     scene="dead leaves, seed 0",
-    scene_hash="0123456789abcdef",
     height=512,
     width=640,
     channels=3,
@@ -36,8 +35,6 @@ CONDITIONS = Conditions(
     compositing="gather",
     reference="reference",
     version="0.1.0",
-    code_hash="fedcba9876543210",
-    commit=None,
     torch="2.13.0",
     device="a machine",
     threads=2,

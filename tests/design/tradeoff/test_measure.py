@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, TiDyOptics
-from kornia_tidy.design.tradeoff import capture, measure, missing, pareto, sweep, sweep_settings
+from kornia_tidy.design.tradeoff import capture, measure, pareto, sweep, sweep_settings
 from kornia_tidy.design.tradeoff.sweep_settings import Setting
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
@@ -139,31 +139,6 @@ class TestSweep(BaseTester):
         rows = list(sweep(TiDyOptics(fidelity=QUICK), *scene(), sweep_settings("draft")))
         assert len(measured) == 1 + len({replace(s.fidelity, name="") for s in sweep_settings("draft")})
         assert [(r.knob, r.value, r.fidelity) for r in rows] == sweep_settings("draft")
-
-    def test_feature_known_rows_are_not_measured_again(self, measured):
-        optics = TiDyOptics(fidelity=QUICK)
-        known = list(sweep(optics, *scene(), settings()[:1]))
-        measured.clear()
-        assert len(list(sweep(optics, *scene(), settings(), known=known))) == 2
-        assert measured == ["truth", settings()[1].fidelity]
-        measured.clear()
-        list(sweep(optics, *scene(), settings()[:1], known=known))
-        assert measured == []
-
-    @pytest.mark.parametrize("more", [{"repeats": 6}, {"training": True}])
-    def test_feature_known_rows_with_less_than_asked_are_measured_again(self, more, measured):
-        options = {"repeats": 5, "training": False, **more}
-        assert len(missing(settings()[:1], [replace(ROW, fidelity=settings()[0].fidelity)], **options)) == 1
-        list(
-            sweep(
-                TiDyOptics(fidelity=QUICK),
-                *scene(),
-                settings()[:1],
-                known=[replace(ROW, fidelity=settings()[0].fidelity)],
-                **options,
-            )
-        )
-        assert len(measured) == 2
 
     def test_feature_a_row_comes_before_the_next_is_measured(self, measured):
         rows = sweep(TiDyOptics(fidelity=QUICK), *scene(), settings())
