@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from kornia_tidy.figures.psf_measures import PSFMeasures
 from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, open_chart, require_matplotlib
+from kornia_tidy.figures.system_statistics import ring_centres
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from kornia_tidy.figures.psf_measures import PSFMeasures
 
 HEADLINE, LABEL, SMALL = 13, 8.5, 7.5  # pt
 CELL, MARGIN, PLOTS = 1.25, 0.75, 3.0  # inches
@@ -117,15 +117,3 @@ def _psi(defocus: float) -> str:
 
 def _middle(measured: PSFMeasures) -> str:
     return measured.channels[len(measured.channels) // 2]
-
-
-def ring_centres(frequencies: int) -> list[float]:
-    """Return the central frequency of each ring in cycles per pixel.
-
-    The rings are those of :func:`kornia_tidy.figures.system_statistics.contrast_transfer`.
-
-    Example:
-        >>> ring_centres(2)
-        [0.125, 0.375]
-    """
-    return [(ring + 0.5) / (2 * frequencies) for ring in range(frequencies)]

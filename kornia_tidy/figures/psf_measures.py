@@ -10,8 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at
-from kornia_tidy.figures.psf import ring_centres
-from kornia_tidy.figures.system_statistics import contrast_transfer
+from kornia_tidy.figures.system_statistics import contrast_transfer, ring_centres
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 

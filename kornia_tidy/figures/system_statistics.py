@@ -76,3 +76,15 @@ def contrast_transfer(psfs: Tensor, frequencies: int = 32) -> Tensor:
     count = torch.bincount(ring, minlength=frequencies)
     sums = spectrum.new_zeros(*spectrum.shape[:-2], frequencies).index_add(-1, ring, spectrum.flatten(-2)[..., seen])
     return sums / count
+
+
+def ring_centres(frequencies: int) -> list[float]:
+    """Return the central frequency of each ring in cycles per pixel.
+
+    The rings are those of :func:`contrast_transfer`.
+
+    Example:
+        >>> ring_centres(2)
+        [0.125, 0.375]
+    """
+    return [(ring + 0.5) / (2 * frequencies) for ring in range(frequencies)]
