@@ -21,6 +21,7 @@ from kornia_tidy.design.fisher_information import defocus_bound, fisher_informat
 from kornia_tidy.masks.base import PhaseMasks, adam_groups
 from kornia_tidy.masks.zernike import ZernikeMask
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.sensor.sensor import SensorNoise
 
@@ -65,8 +66,8 @@ def design(
     return history
 
 
-def point_error(bank: PSFBank) -> Tensor:
-    r"""Return the squared distance between PSFs and the unit impulse, averaged over defocus and channels.
+def point_error(bank: PSFBank | FieldBank) -> Tensor:
+    r"""Return the squared distance between PSFs and the unit impulse, averaged over defocus, channels and field.
 
     .. math:: \frac{1}{DC} \sum_{dc} \| h_{dc} - \delta \|^2
 
@@ -92,7 +93,7 @@ def point_error(bank: PSFBank) -> Tensor:
 
 
 def restoration_error(
-    bank: PSFBank, noise: float | SensorNoise = 0.05, statistics: SceneStatistics = PHOTOGRAPHS
+    bank: PSFBank | FieldBank, noise: float | SensorNoise = 0.05, statistics: SceneStatistics = PHOTOGRAPHS
 ) -> Tensor:
     r"""Return the mean squared error, in sRGB, of restoration by one Wiener filter for all depths.
 
@@ -114,7 +115,8 @@ def restoration_error(
 
     Args:
         bank: PSFs of a lens whose fidelity discards stray light or spreads it over the image; the result is the mean
-            over its channels. Windows that cut off much of the light, or are renormalised, give errors too low.
+            over its channels. Windows that cut off much of the light, or are renormalised, give errors too low. Of PSFs
+            over the field it is the mean over the points, each with the filter of its place.
         noise: the sensor, with its shot and read noise; or the standard deviation of noise that is the same in all
             pixels, as a fraction of the standard deviation of the scenes' light.
         statistics: of the scenes. Their distribution of depth is spread over the nodes of the bank.
@@ -139,6 +141,9 @@ def restoration_error(
         >>> bool(restoration_error(bank, noise=1e-3) < 1e-4)
         True
     """
+    if isinstance(bank, FieldBank):
+        places = [restoration_error(bank.at(index), noise, statistics) for index in range(len(bank.psfs))]
+        return torch.stack(places).mean()
     read, shot = _noise_variances(noise, statistics)
     size = 2 * bank.window
     precise = torch.promote_types(bank.psfs.dtype, torch.float32)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -73,7 +73,8 @@ class FieldBank:
 
     def at(self, index: int) -> PSFBank:
         """Return the bank of one point of the field; its PSFs keep the light that they have there."""
-        return PSFBank(self.psfs[index], self.defocus, self.energy[index])
+        veil = None if self.veil is None else self.veil[index]
+        return PSFBank(self.psfs[index], self.defocus, self.energy[index], veil)
 
     def between(self, field: Field, pixel: tuple[float, float]) -> PSFBank:
         """Return the PSFs at a pixel of the picture, from the nodes of its field in this bank.
@@ -95,13 +96,15 @@ class FieldBank:
         """Return a bank in which the light outside the window is dealt with.
 
         Args:
-            kind: ``"renormalize"`` scales each PSF to the light of its point; ``"veil"`` and ``"discard"`` leave it.
+            kind: ``"renormalize"`` scales each PSF to the light of its point; ``"veil"`` keeps the PSFs and spreads the
+                missing light over the image; ``"discard"`` loses it.
         """
         check_choice("stray_light", kind, STRAY_LIGHT)
-        if kind != "renormalize":
-            return self
-        energy = self.energy.clamp(min=torch.finfo(self.energy.dtype).tiny)
-        return FieldBank(self.psfs / energy[..., None, None], self.defocus, self.field, self.energy, self.light)
+        if kind == "renormalize":
+            return replace(
+                self, psfs=self.psfs / self.energy.clamp(min=torch.finfo(self.energy.dtype).tiny)[..., None, None]
+            )
+        return replace(self, veil=(1 - self.energy).clamp(min=0) * self.light if kind == "veil" else None)
 
 
 @on_cpu

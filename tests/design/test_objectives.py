@@ -13,6 +13,7 @@ from kornia_tidy.design.fisher_information import crlb
 from kornia_tidy.design.objectives import design, design_fisher_mask, point_error, restoration_error
 from kornia_tidy.masks import CubicMask
 from kornia_tidy.psf import PSFBank
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
@@ -95,6 +96,16 @@ class TestRestorationError(BaseTester):
         share, transfer, spectrum, best = self._best_filter(bank, scenes, 0.2 * 0.3)
         error = (share * np.abs(1 - best * transfer) ** 2).sum(0) * spectrum + np.abs(best) ** 2 * (0.2 * 0.3) ** 2
         assert float(restoration_error(bank, 0.2, scenes)) == pytest.approx(error.mean() / 0.3**2, rel=1e-9)
+
+    def test_feature_over_the_field_it_is_the_mean_over_the_places(self):
+        banks = self._dim_bank(True), self._dim_bank(True)
+        psfs, energy, veil = (
+            torch.stack([getattr(bank, part) for bank in banks]) for part in ("psfs", "energy", "veil")
+        )
+        whole = FieldBank(psfs, banks[0].defocus, torch.zeros(2, 2), energy, torch.ones_like(energy), veil)
+        one, other = (float(restoration_error(bank)) for bank in banks)
+        assert float(restoration_error(whole)) == pytest.approx((one + other) / 2, rel=1e-9)
+        assert one != other
 
     @pytest.mark.parametrize("sensor", [SensorNoise(0.04), SensorNoise(0.01, full_well=200, dark=3)])
     def test_feature_in_srgb_it_is_the_sum_over_all_pairs_of_pixels(self, sensor):
