@@ -10,9 +10,11 @@ from kornia_tidy.signals import end_on_signals, is_command
 if is_command():
     end_on_signals()  # during the imports that follow, which take seconds
 
+import sys
 from typing import TYPE_CHECKING
 
 from kornia_tidy.lazy import importer
+from kornia_tidy.moved import MovedModules
 from kornia_tidy.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -69,6 +71,7 @@ _MODULES = {
     "sensor.sensor": ("SensorNoise",),
 }
 __getattr__ = importer(__name__, _MODULES)
+sys.meta_path.append(MovedModules())
 
 
 def __dir__() -> list[str]:
