@@ -35,12 +35,11 @@ KNOBS = (
     "plan",
 )  # fmt: skip
 DEMOSAIC = (
-    "bilinear", "half", "kornia", "opencv_bilinear", "opencv_edge_aware", "opencv_vng", "libraw_linear", "libraw_vng",
-    "libraw_ppg", "libraw_ahd", "libraw_dcb", "libraw_dht", "libraw_markesteijn",
+    "bilinear", "half", "libraw_linear", "libraw_vng", "libraw_ppg", "libraw_ahd", "libraw_dcb", "libraw_dht",
+    "libraw_markesteijn",
 )  # fmt: skip
 WHITE_BALANCES = ("as shot", "daylight", "auto", "none")
 HIGHLIGHTS = ("clip", "keep")
-ADAPTATIONS = ("Bradford", "CAT02", "CAT16", "Von Kries")
 PRETRAINED = ("joint-uncertain", "edof-5", "edof-1", "edof-designed", "edof-flat")
 """Shipped systems: task and number of masks. ``"edof-5"`` and ``"edof-1"`` have the paper's lens of f/17.6. The
 networks of ``"edof-designed"``, five masks of 92 x 92 pixels at f/22, and of ``"edof-flat"``, none at f/48, know light

@@ -9,7 +9,6 @@ from kornia_tidy.camera import camera_state
 from kornia_tidy.design.tradeoff.sweep_settings import PLAN, SWEEP_VALUES
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.lab.mask_export import placement
-from kornia_tidy.lab.raw.color import ADAPTATIONS
 from kornia_tidy.lab.raw.demosaic import METHODS
 from kornia_tidy.lab.raw.develop import HIGHLIGHTS
 from kornia_tidy.modulator import switching
@@ -50,7 +49,6 @@ class TestChoices(BaseTester):
             ("KNOBS", (*SWEEP_VALUES, PLAN)),
             ("DEMOSAIC", METHODS),
             ("HIGHLIGHTS", HIGHLIGHTS),
-            ("ADAPTATIONS", ADAPTATIONS),
         ],
     )
     def test_feature_names_are_those_of_what_they_name(self, name, named):

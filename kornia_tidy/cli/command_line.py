@@ -49,7 +49,7 @@ COMMANDS: Commands = {
 }
 """Commands by name: module and class, or the commands of a group."""
 ABOUT = {
-    "masks": "Masks -> SLM frames, heights, STL; and back.",
+    "masks": "Masks -> SLM frames, heights; and back.",
     "raw": "Camera raw files: what they hold, pictures of them, calibrations, reconstructions.",
 }
 """What the groups do."""

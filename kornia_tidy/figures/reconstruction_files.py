@@ -116,11 +116,10 @@ def reconstruct_files(
     resume: bool = False,
     picture: str = ".png",
     depth_unit: float = 1e-3,
-    jobs: int = 1,
     memory_budget: int = 512 << 20,
     overlap: int = OVERLAP,
 ) -> list[Row]:
-    """Reconstruct captures of files into a folder, several at a time, and go on after errors.
+    """Reconstruct captures of files into a folder, and go on after errors.
 
     Args:
         files: captures.
@@ -133,8 +132,7 @@ def reconstruct_files(
         resume: keep results that are complete, of the same file and ``made_by``.
         picture: suffix of the picture of 16 bits.
         depth_unit: metres of a unit of depth in PNG files.
-        jobs: files at a time, each in a thread.
-        memory_budget: bytes for the network's tiles, of all jobs.
+        memory_budget: bytes for the network's tiles.
         overlap: pixels of a tile that are discarded at each cut.
 
     Returns:
@@ -150,8 +148,6 @@ def reconstruct_files(
     folder.mkdir(parents=True, exist_ok=True)
     if resume:
         remove_leftovers(folder)
-    if head.field is None:
-        reconstruct_light(head, torch.zeros(3, 1, 1))  # measures the network's memory once for all jobs
 
     def work(path: str, progress: Callable[[int, int], None]) -> Row:
         start, paths = time.perf_counter(), outputs[path]
@@ -159,8 +155,8 @@ def reconstruct_files(
         if resume and _is_finished(paths, made_of):
             return Row(path, "kept")
         capture = read(path)
-        options: dict[str, Any] = {"memory_budget": memory_budget // jobs, "overlap": overlap, "progress": progress}
-        own = with_noise_of(head, capture.noise)  # no other thread's
+        options: dict[str, Any] = {"memory_budget": memory_budget, "overlap": overlap, "progress": progress}
+        own = with_noise_of(head, capture.noise)
         result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
         size = write_reconstruction(paths[:-1], result, capture, head, depth_unit)
         record = {**made_of, "size": size, **(words or {}), **reconstruction_in_words(head, depth_unit)}
@@ -169,7 +165,7 @@ def reconstruct_files(
         write_bytes(paths[-1], (json.dumps(record, indent=1) + "\n").encode())
         return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start, result.notes)
 
-    return work_on_all("reconstruct", list(outputs), work, jobs)
+    return work_on_all("reconstruct", list(outputs), work)
 
 
 def _is_finished(paths: Sequence[Path], made_of: Mapping[str, Any]) -> bool:

@@ -1,15 +1,12 @@
-"""Work on several files at a time, with a progress bar, its summary, and where the results go."""
+"""Work on several files, with a progress bar, its summary, and where the results go."""
 
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
 from tqdm import tqdm
 
 
@@ -48,61 +45,32 @@ def for_each_file(paths: Sequence[str], work: Callable[[str], None]) -> None:
         raise ValueError(f"{failed} of {len(paths)} files failed")
 
 
-def work_on_all(
-    title: str, paths: list[str], work: Callable[[str, Callable[[int, int], None]], Row], jobs: int = 1
-) -> list[Row]:
-    """Process all files, several at a time, and go on after errors; an interrupt ends all between two tiles.
+def work_on_all(title: str, paths: Sequence[str], work: Callable[[str, Callable[[int, int], None]], Row]) -> list[Row]:
+    """Process files one after another with a progress bar, and go on after errors.
 
     Args:
         title: of the progress bar.
         paths: of the files.
         work: processes a file and returns its row. It is also given a function to call with the number of tiles that
-            are done and of all; there an interrupt of another file ends it.
-        jobs: files at a time, each in a thread: threads share the weights of a network in memory, and long operations
-            release the interpreter lock.
+            are done and of all.
 
     Returns:
-        Rows in the order of the files. An error is printed, and becomes the result of its row.
+        A row for each file; of one that failed the sentence of its error, which is also printed.
 
     Example:
-        >>> [row.result for row in work_on_all("measure", ["a", "b"], lambda path, progress: Row(path, "done"), jobs=2)]
+        >>> [row.result for row in work_on_all("measure", ["a", "b"], lambda path, progress: Row(path, "done"))]
         ['done', 'done']
     """
-    stop = threading.Event()
-    lock = threading.Lock()
-    rows: dict[str, Row] = {}
+    rows = []
     form = "{l_bar}{bar}| {n:.2f}/{total} [{elapsed}<{remaining}]"
     with tqdm(total=len(paths), desc=title, file=sys.stderr, leave=False, bar_format=form) as bar:
-
-        def each(path: str) -> Row:
-            shown = 0.0
-
-            def progress(done: int, tiles: int) -> None:
-                nonlocal shown
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                with lock:
-                    bar.update(done / tiles - shown)
-                shown = done / tiles
-
-            if stop.is_set():
-                raise KeyboardInterrupt
+        for number, path in enumerate(paths):
             try:
-                return work(path, progress)
-            finally:
-                with lock:
-                    bar.update(1 - shown)
-
-        with ThreadPoolExecutor(jobs, initializer=_share_cores, initargs=(jobs,)) as pool:
-            futures = {pool.submit(each, path): path for path in paths}
-            try:
-                for future in as_completed(futures):
-                    rows[futures[future]] = _row(futures[future], future)
-            except BaseException:
-                stop.set()
-                pool.shutdown(cancel_futures=True)
-                raise
-    return [rows[path] for path in paths]
+                rows.append(work(path, lambda done, tiles: bar.update(number + done / tiles - bar.n)))  # noqa: B023
+            except Exception as error:
+                rows.append(Row(path, _print_error(error)))
+            bar.update(number + 1 - bar.n)
+    return rows
 
 
 def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) -> dict[str, list[Path]]:
@@ -153,22 +121,9 @@ def table(rows: list[Row]) -> list[str]:
     return lines
 
 
-def _row(path: str, future: Future[Row]) -> Row:
-    """Return the summary row of a processed file; an error is printed and becomes the text of the row."""
-    try:
-        return future.result()
-    except Exception as error:
-        return Row(path, _print_error(error))
-
-
 def _print_error(error: Exception) -> str:
     """Print an error as one sentence, and return the sentence."""
     sentence = " ".join(str(error).split()) or type(error).__name__
     tqdm.write(f"kornia-tidy: error: {sentence}", file=sys.stderr)
     sys.stderr.flush()
     return sentence
-
-
-def _share_cores(jobs: int) -> None:
-    if jobs > 1:
-        torch.set_num_threads(max(1, torch.get_num_threads() // jobs))

@@ -1,4 +1,4 @@
-"""`kornia-tidy masks`: export of masks to SLM frames, heights or STL, and import of frames."""
+"""`kornia-tidy masks`: export of masks to SLM frames or heights, and import of frames."""
 
 from __future__ import annotations
 
@@ -70,19 +70,6 @@ class Timing:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plate:
-    """Plate (STL).
-
-    Args:
-        mask: which mask, from 0; needed if there are several. None: the only one.
-        base: its thickness.
-    """
-
-    mask: Annotated[int, Unit("K", "", 0)] | None = None
-    base: Metres = 1e-3
-
-
-@dataclass(frozen=True, kw_only=True)
 class ShowMasks:
     """List the masks of a file.
 
@@ -112,7 +99,7 @@ class ShowMasks:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportMasks:
-    """Write SLM frames, heights or STL.
+    """Write SLM frames or heights.
 
     A state_dict tells the masks' family, constraint and material, and the modulator; its
     grey levels, dwell and switching times are the defaults of frames. One of only masks (phase in radians at 530 nm)
@@ -122,19 +109,17 @@ class ExportMasks:
                 back; up to 8 bits in 8-bit files, 9 and 10 in the least
                 significant bits of 16-bit files
       x.npy     heights in metres
-      x.stl     one mask on a plate, in millimetres
     Files are written atomically, and frames are read back and compared.
 
     Args:
         masks: heights in metres (.npy, K x rows x columns), a camera's state_dict, or a checkpoint (.safetensors).
-        output: a folder, x.npy or x.stl.
+        output: a folder, or x.npy.
         material: what turns height into phase. None: as saved, or constant, index 1.5 at every wavelength.
         force: replace earlier files.
         pupil_radius: of the pupil on the panel or the plate; the mask is 2.3 radii wide. None: on a panel the largest
             with a whole number of panel pixels per mask pixel.
         panel: of frames.
         timing: of frames.
-        plate: of an STL file.
     """
 
     masks: MasksFile
@@ -144,7 +129,6 @@ class ExportMasks:
     pupil_radius: Metres | None = None
     panel: Panel = field(default_factory=Panel)
     timing: Timing = field(default_factory=Timing)
-    plate: Plate = field(default_factory=Plate)
 
     examples: ClassVar = """\
   Frames for a 1920 x 1200 panel, seen through a mirror:
@@ -153,26 +137,21 @@ class ExportMasks:
   A 10-bit panel with a measured response and swaps of 4 ms:
     kornia-tidy masks export heights.npy -o slm --bits 10 --response lut.csv \\
         --exposure 0.1 --switching-time 0.004 --wavelength 532e-9
-
-  The second mask for a printer, over a pupil of 4 mm:
-    kornia-tidy masks export heights.npy -o mask.stl --mask 1 --pupil-radius 2e-3
 """
 
     def run(self) -> None:
-        """Export masks as SLM frames, heights or STL, by the name of the output."""
+        """Export masks as SLM frames or heights, by the name of the output."""
         from kornia_tidy.checks import check_choice
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.lab.mask_export.mask_files import write_heights
 
         kind = Path(self.output).suffix.lower()
-        check_choice("the suffix of what to write", kind, ("", ".npy", ".stl"))
+        check_choice("the suffix of what to write", kind, ("", ".npy"))
         _check_absent(self.output, self.force, self.masks, folder=not kind)
         saved = _saved(self.masks, self.material)
         tell("masks", _in_words(saved.heights))
         if kind == ".npy":
             write_heights(self.output, saved.heights)
-        elif kind == ".stl":
-            self._stl(saved.heights)
         else:
             self._frames(saved)
         tell("wrote", self.output)
@@ -207,18 +186,6 @@ class ExportMasks:
         tell("check", f"read back, phase differs by up to {error:.3g} rad, {share / 2:.3f} grey levels, 0.5 allowed")
         if share > 1:
             raise ValueError(f"{self.output} does not hold the masks: phase differs by {error:.3g} rad")
-
-    def _stl(self, heights: Tensor) -> None:
-        from kornia_tidy.lab.mask_export.printing import write_stl
-
-        index = self.plate.mask
-        if self.pupil_radius is None:
-            raise ValueError("an STL file needs --pupil-radius, the metres of which 2.3 span the mask")
-        if index is None and len(heights) == 1:
-            index = 0
-        if index is None or not 0 <= index < len(heights):
-            raise ValueError(f"an STL file holds one mask: --mask must be from 0 to {len(heights) - 1}, got {index}")
-        write_stl(self.output, heights[index], self.pupil_radius, self.plate.base)
 
 
 @dataclass(frozen=True, kw_only=True)

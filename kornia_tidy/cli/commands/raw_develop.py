@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from kornia_tidy.choices import ADAPTATIONS, DEMOSAIC, HIGHLIGHTS
+from kornia_tidy.choices import DEMOSAIC, HIGHLIGHTS
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
 from kornia_tidy.cli.commands.shared import Folder
 from kornia_tidy.settings import one_of
@@ -34,7 +34,6 @@ class DevelopRaw:
         white_balance: as-shot, daylight, auto (bright areas are grey on average), none, or a factor for each colour.
             None: as shot, else daylight, else none.
         highlights: clip all channels where the first saturates, or keep what others saw above.
-        adaptation: chromatic adaptation of eyes. None: only the white balance, as LibRaw.
         linear: linear light in the 16-bit picture, not encoded as sRGB.
         sensor_grid: pixels as on the sensor: neither turned nor stretched.
         dump: layout of a headerless file.
@@ -48,7 +47,6 @@ class DevelopRaw:
     demosaic: Annotated[str, one_of(DEMOSAIC)] | None = None
     white_balance: WhiteBalance = ()
     highlights: Annotated[str, one_of(HIGHLIGHTS)] = "clip"
-    adaptation: Annotated[str, one_of(ADAPTATIONS)] | None = None
     linear: bool = False
     sensor_grid: bool = False
     dump: Dump = field(default_factory=Dump)
@@ -108,7 +106,6 @@ The first example in Python:
                     self.demosaic,
                     white_balance=balance,
                     highlights=self.highlights,
-                    adaptation=self.adaptation,
                     encoded=False,
                     square_pixels=not self.sensor_grid,
                     upright=not self.sensor_grid,

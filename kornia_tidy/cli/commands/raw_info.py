@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
 
@@ -20,20 +19,15 @@ class InfoOfRaw:
 
     Args:
         files: camera raw files.
-        json: print one JSON array, an object for each file.
         dump: layout of a headerless file.
     """
 
     files: RawFiles
-    json: bool = False
     dump: Dump = field(default_factory=Dump)
 
     examples: ClassVar = """\
   All files of a folder, those that fail are named at the end:
     kornia-tidy raw info shots/*.dng
-
-  For a script, one object a file:
-    kornia-tidy raw info --json shots/*.dng > shots.json
 
   A bare dump of counts, 16 bits each:
     kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
@@ -43,26 +37,12 @@ class InfoOfRaw:
         """Print the properties of raw files."""
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.lab.file_jobs import for_each_file
-        from kornia_tidy.lab.raw.properties import raw_in_words, raw_properties
-
-        objects: list[dict[str, Any]] = []
+        from kornia_tidy.lab.raw.properties import raw_in_words
 
         def look(path: str) -> None:
-            objects.append({"file": path})
-            try:
-                raw = self.dump.open(path)
-            except (OSError, ValueError) as error:
-                objects[-1]["error"] = str(error)
-                raise
-            objects[-1].update(raw_properties(raw))
-            if not self.json:
-                tell("file", path)
-                for topic, text in raw_in_words(raw):
-                    tell(topic, text)
-                print(flush=True)
+            topics = raw_in_words(self.dump.open(path))
+            for topic, text in [("file", path), *topics]:
+                tell(topic, text)
+            print(flush=True)
 
-        try:
-            for_each_file(self.files, look)
-        finally:
-            if self.json:
-                print(json.dumps(objects, indent=2), flush=True)
+        for_each_file(self.files, look)

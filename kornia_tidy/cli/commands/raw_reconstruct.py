@@ -22,7 +22,7 @@ from kornia_tidy.cli.commands.shared import (
 )
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA, CLOSED_FORMS
 from kornia_tidy.reconstruction.settings import LensSettings
-from kornia_tidy.settings import Count, Metres, Pixels, Unit, one_of
+from kornia_tidy.settings import Metres, Pixels, Unit, one_of
 
 if TYPE_CHECKING:
     from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -74,8 +74,7 @@ class ReconstructRaw:
         linear: FILES that are pictures hold linear light, not sRGB.
         white_balance: as-shot, daylight, auto (bright areas are grey on average), none, or a factor for each colour.
             None: as shot, else daylight, else none.
-        jobs: files at a time.
-        memory: for the network's tiles, of all jobs.
+        memory: for the network's tiles.
         overlap: pixels discarded on each side of a cut between tiles; with 144, shipped networks are within 0.0002 of
             the result for the whole picture; beyond the reach of a network, as with 1000, the result is exact.
         orientations: of the input, for the average of a network that begins with the closed form: with 8, images of
@@ -98,7 +97,6 @@ class ReconstructRaw:
     depth_unit: Metres = 1e-3
     linear: bool = False
     white_balance: WhiteBalance = ()
-    jobs: Count = 1
     memory: Annotated[int, Unit("MIB", "MiB", 1)] = 512
     overlap: Pixels = 144
     orientations: Annotated[int, one_of(ORIENTATIONS)] = 1
@@ -107,7 +105,7 @@ class ReconstructRaw:
 
     basic: ClassVar = (
         *("files", "output", "head", "psfs", "masks", "lens", "noise", "resume", "format", "depth_unit", "linear"),
-        *("white_balance", "jobs", "memory", "orientations", "device"),
+        *("white_balance", "memory", "orientations", "device"),
     )
     notes: ClassVar = """\
 Without a network of your camera, give the camera: its file as HEAD, its measured PSFs, or
@@ -146,8 +144,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
     kornia-tidy raw reconstruct shots/*.dng --masks heights.npy --lens single-50mm \\
         --f-number 12 --focus-distance 0.7 --noise iso800.json -o sharp
 
-  A network of one's own; of two files, one is read and written while the other is computed:
-    kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths --jobs 2
+  A network of one's own:
+    kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths
 """
 
     def run(self) -> None:
@@ -193,7 +191,6 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             resume=self.resume,
             picture=SUFFIXES[self.format],
             depth_unit=self.depth_unit,
-            jobs=self.jobs,
             memory_budget=self.memory << 20,
             overlap=self.overlap,
         )

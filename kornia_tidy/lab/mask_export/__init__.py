@@ -1,13 +1,12 @@
-"""Mask export: masks as frames for a spatial light modulator (SLM), as height files, and as a body for 3-D printing.
+"""Mask export: masks as frames for a spatial light modulator (SLM) and as height files.
 
 Phase masks, or heights in metres, come in. Files go out, and can be read back to heights: a folder of SLM frames with a
-timing sheet, NPY or safetensors, STL (written only). Read ``slm_frames.py`` first.
+timing sheet, NPY or safetensors. Read ``slm_frames.py`` first.
 """
 
 from kornia_tidy.lab.mask_export.frame_files import SLMFrames, read_slm_frames, write_slm_frames
 from kornia_tidy.lab.mask_export.mask_files import read_heights, write_heights
 from kornia_tidy.lab.mask_export.placement import PanelPlacement
-from kornia_tidy.lab.mask_export.printing import write_stl
 from kornia_tidy.lab.mask_export.response_file import read_response
 from kornia_tidy.lab.mask_export.timing import FrameTime, frame_times
 
@@ -21,5 +20,4 @@ __all__ = [
     "read_slm_frames",
     "write_heights",
     "write_slm_frames",
-    "write_stl",
 ]

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice
 from kornia_tidy.search_path import import_installed
 
 # Linear sRGB from CIE XYZ with white (D65) at Y = 1, from the primaries of IEC 61966-2-1. XYZ from sRGB is its inverse.
@@ -20,7 +19,6 @@ SRGB_FROM_XYZ = (
     (-0.9692660, 1.8760108, 0.0415560),
     (0.0556434, -0.2040259, 1.0572252),
 )
-ADAPTATIONS = ("Bradford", "CAT02", "CAT16", "Von Kries")
 ASSUMED_CAMERA = "Nikon 5100 (NPL)"  # as colour-science names its measured sensitivities
 
 
@@ -72,42 +70,6 @@ def assumed_camera_to_srgb() -> tuple[Tensor, Tensor]:
     to_srgb = torch.as_tensor(from_aces @ matrix)
     to_srgb = to_srgb / to_srgb.sum(1, keepdim=True)  # colour's white points are rounded: 1e-4
     return to_srgb.float(), torch.as_tensor(daylight).float()
-
-
-def adapted_to_srgb(matrix: Tensor, daylight: Tensor, balance: Tensor, adaptation: str) -> Tensor:
-    """Return the colour matrix with chromatic adaptation from the scene's illuminant to D65, (3, n).
-
-    White balance scales the channels of the camera, while the eye adapts by its cone responses. The matrix therefore
-    replaces the factors by those of daylight, converts to XYZ, and adapts the white of the illuminant to D65 in cone
-    responses.
-
-    Args:
-        matrix: colour matrix for daylight, (3, n), from :func:`camera_to_srgb`.
-        daylight: white balance factors for daylight, (n,), from :func:`camera_to_srgb`.
-        balance: factors (n,) applied to the colours, assumed to map the illuminant to white.
-        adaptation: a transform of colour-science: ``"Bradford"``, ``"CAT02"``, ``"CAT16"`` or ``"Von Kries"``.
-
-    Raises:
-        ValueError: if the transform is unknown, or the factors give an illuminant with a negative XYZ.
-
-    Example:
-        >>> matrix, daylight = torch.eye(3), torch.ones(3)
-        >>> adapted_to_srgb(matrix, daylight, torch.tensor([1.0, 1.0, 1.0]), "Bradford").diagonal().round(decimals=4)
-        tensor([1., 1., 1.])
-    """
-    check_choice("chromatic adaptation", adaptation, ADAPTATIONS)
-    from_xyz = srgb_from_xyz()
-    undone = matrix.double() * (daylight.double() / balance.double())
-    light = from_xyz.inverse() @ undone.sum(1)
-    if not bool((light > 0).all()):
-        raise ValueError(f"white balance {balance.tolist()} belongs to no illuminant: its XYZ is {light.tolist()}")
-    white = from_xyz.inverse().sum(1)
-    with _colour_science() as colour:
-        moved = colour.adaptation.matrix_chromatic_adaptation_VonKries(
-            (light / light[1]).numpy(), white.numpy(), transform=adaptation
-        )
-    result = from_xyz @ torch.as_tensor(moved) @ from_xyz.inverse() @ undone
-    return (result / light[1]).to(matrix)
 
 
 def srgb_from_xyz() -> Tensor:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import io
 import itertools
 
-import cv2
 import numpy as np
 import torch
-from kornia.color import CFA, raw_to_rgb
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_float_tensor
@@ -18,9 +16,7 @@ from kornia_tidy.lab.raw.filter_array import Tile, is_xtrans
 from kornia_tidy.lab.raw.quantised_demosaicing import ROWS_AT_ONCE, demosaic_quantised
 from kornia_tidy.search_path import import_installed
 
-# kornia and OpenCV's older names denote a Bayer array by its pixels (1, 1) and (1, 2), not by its corner.
-BAYER = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
-OPENCV = {"bilinear": ("", 16), "edge_aware": ("_EA", 16), "vng": ("_VNG", 8)}  # suffix and bits
+BAYER = ("RGGB", "GRBG", "BGGR", "GBRG")
 # For other names LibRaw silently falls back on VNG for four colours and on Markesteijn's three passes for X-Trans.
 LIBRAW = {
     "Bayer": ("linear", "vng", "ppg", "ahd", "dcb", "dht"),
@@ -36,8 +32,6 @@ LIBRAW_SMALLEST = {"Bayer": 22, "four-colour": 22, "X-Trans": 512}  # least shor
 METHODS = (
     "bilinear",
     "half",
-    "kornia",
-    *(f"opencv_{name}" for name in OPENCV),
     *dict.fromkeys(f"libraw_{name}" for names in LIBRAW.values() for name in names),
 )
 
@@ -57,8 +51,6 @@ def demosaic(
             * ``"bilinear"``: for any tile; differentiable, on any device, not quantised. Samples are kept; missing
               values are the mean of the same colour nearby, weighted by a tent.
             * ``"half"``: no interpolation. Each 2x2 tile (3x3 for X-Trans) becomes one pixel, the mean of each colour.
-            * ``"kornia"``: bilinear, Bayer of even height and width; differentiable, on any device.
-            * ``"opencv_bilinear"``, ``"opencv_edge_aware"``: Bayer. ``"opencv_vng"``: Bayer, and only 8 bits.
             * ``"libraw_linear"``, ``"libraw_vng"``: Bayer and four-colour; ``"libraw_ppg"``, ``"libraw_ahd"``,
               ``"libraw_dcb"``, ``"libraw_dht"``: Bayer; ``"libraw_markesteijn"``: X-Trans.
         to_srgb: matrix from the balanced colours to linear sRGB, (3, 3). ``"libraw_ahd"`` and
@@ -69,12 +61,12 @@ def demosaic(
 
     Raises:
         ValueError: if the method is unknown or does not support this tile or size, if the mosaic has another shape, or
-            if it is not finite (OpenCV and LibRaw).
+            if it is not finite (LibRaw).
 
     Convention:
         - Nothing is clipped: values below 0 and above 1 are interpolated like others.
-        - OpenCV and LibRaw compute with integers. The range of the mosaic, extended to include 0 and 1, is quantised to
-          65535 steps (``"opencv_vng"``: 255), of 1.5e-5 for values in [0, 1]. These methods have no gradient.
+        - LibRaw computes with integers. The range of the mosaic, extended to include 0 and 1, is quantised to 65535
+          steps, of 1.5e-5 for values in [0, 1]. These methods have no gradient.
 
     Source: VNG: Chang, Cheung and Pang 1999. AHD: Hirakawa and Parks 2005. PPG: Lin 2003. DCB: Góźdź. X-Trans:
         Markesteijn, in dcraw.
@@ -124,20 +116,13 @@ def _demosaic(
     height, width = mosaic.shape[-2:]
     if height < len(tile) or width < len(tile[0]):
         raise ValueError(f"mosaic must hold one tile of {len(tile)} x {len(tile[0])} px, got {height} x {width}")
-    library, _, name = method.partition("_")
     flat = mosaic.reshape(-1, height, width)
     letters = "".join(names[index] for row in tile for index in row)
     if method in {"bilinear", "half"}:
         image = (bilinear if method == "bilinear" else binned)(flat, tile)
-    elif library == "kornia":
-        image = _kornia(flat, letters, names)
     else:
         matrix = torch.eye(len(names)) if mixture is None else mixture
-        if library == "libraw":
-            image = _libraw(flat, letters, names, name, to_srgb, matrix)
-        else:
-            image = _opencv(flat, letters, names, name, matrix)
-        mixture = None
+        image, mixture = _libraw(flat, letters, names, method.removeprefix("libraw_"), to_srgb, matrix), None
     if mixture is not None:
         image = mixed(image, mixture)
     return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
@@ -217,23 +202,6 @@ def _holds_all(tile: Tile, side: int, step: int) -> bool:
     )
 
 
-def _kornia(mosaic: Tensor, letters: str, colors: str) -> Tensor:
-    check_choice("the filter array of demosaicing by kornia", letters, tuple(BAYER))
-    if mosaic.shape[-2] % 2 or mosaic.shape[-1] % 2:
-        raise ValueError(f"demosaicing by kornia needs even height and width, got {tuple(mosaic.shape[-2:])}")
-    values = mosaic if mosaic.dtype == torch.float64 else mosaic.float()
-    image = raw_to_rgb(values[:, None], BAYER[letters]).to(mosaic.dtype)
-    return image if colors == "RGB" else image[:, ["RGB".index(letter) for letter in colors]]
-
-
-def _opencv(mosaic: Tensor, letters: str, colors: str, name: str, matrix: Tensor) -> Tensor:
-    check_choice("the filter array of demosaicing by OpenCV", letters, tuple(BAYER))
-    suffix, bits = OPENCV[name]
-    code = getattr(cv2, f"COLOR_Bayer{letters}2RGB{suffix}")  # these names denote the array from its corner
-    matrix = matrix[:, [colors.index(letter) for letter in "RGB"]]
-    return demosaic_quantised(mosaic, lambda counts: cv2.demosaicing(counts, code), bits, matrix)
-
-
 def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
     rawpy = import_installed("rawpy")  # a C++ library, loaded only when needed
 
@@ -264,7 +232,7 @@ def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tenso
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
-    image = demosaic_quantised(wide, postprocess, 16, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
+    image = demosaic_quantised(wide, postprocess, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 
 

@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.lab.raw.auto_balance import auto_balance
-from kornia_tidy.lab.raw.color import adapted_to_srgb, assumed_camera_to_srgb, camera_to_srgb
+from kornia_tidy.lab.raw.color import assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.lab.raw.demosaic import BAYER, demosaic_to_srgb, mixed
 from kornia_tidy.lab.raw.filter_array import is_xtrans, tiled
 
@@ -28,7 +28,6 @@ def develop(
     method: str | None = None,
     white_balance: str | Tensor | None = None,
     highlights: str = "clip",
-    adaptation: str | None = None,
     matrix: Tensor | None = None,
     encoded: bool = True,
     square_pixels: bool = True,
@@ -50,8 +49,6 @@ def develop(
         highlights: white balance raises the saturation level of a channel by its factor. ``"clip"`` clips all channels
             to the lowest of these levels, which becomes 1, so that saturated pixels are white. ``"keep"`` keeps values
             above 1; where a channel is saturated, their colours are false.
-        adaptation: chromatic adaptation, see :func:`~kornia_tidy.lab.raw.color.adapted_to_srgb`. Default: only the
-            white balance of the camera's channels, as in LibRaw.
         matrix: from balanced colours to linear sRGB, (3, colours). Default: the capture's own or, if it has none and
             its filters are R, G and B, that of :func:`~kornia_tidy.lab.raw.color.assumed_camera_to_srgb`.
         encoded: apply the sRGB encoding; False returns linear light.
@@ -90,7 +87,7 @@ def develop(
             )
         factors = balance_factors(raw, white_balance)
         _balance(mosaic, raw, factors / factors.min())
-        to_srgb = srgb_matrix(raw, factors, adaptation) if matrix is None else _checked(matrix, raw)
+        to_srgb = srgb_matrix(raw) if matrix is None else _checked(matrix, raw)
     if highlights == "clip":
         mosaic.clamp_(max=1)
     if to_srgb is None:
@@ -148,30 +145,21 @@ def balance_factors(raw: RawCapture, white_balance: str | Tensor | None = None) 
     return white_balance.to(none)
 
 
-def srgb_matrix(raw: RawCapture, factors: Tensor, adaptation: str | None = None) -> Tensor:
+def srgb_matrix(raw: RawCapture) -> Tensor:
     """Return the matrix (3, colours) from a capture's balanced colours to linear sRGB.
-
-    Args:
-        raw: the capture.
-        factors: its white balance, as :func:`balance_factors` returns it.
-        adaptation: as for :func:`develop`.
 
     Raises:
         ValueError: if no matrix is known and the filters are not R, G and B.
     """
     names = "".join(dict.fromkeys(raw.colors))
-    first = [raw.colors.index(letter) for letter in names]
     origin = matrix_origin(raw)
     if origin == "file" and raw.camera_to_srgb is not None:
-        matrix = raw.camera_to_srgb
-        daylight = torch.ones(len(names)) if raw.daylight_balance is None else raw.daylight_balance[first]
-    elif origin == "model" and raw.xyz_to_camera is not None:
-        matrix, daylight = camera_to_srgb(raw.xyz_to_camera)
-    elif names == "RGB":
-        matrix, daylight = assumed_camera_to_srgb()
-    else:
-        raise ValueError(f"the capture has no colour matrix for its filters {names}: give a matrix")
-    return matrix if adaptation is None else adapted_to_srgb(matrix, daylight, factors[first], adaptation)
+        return raw.camera_to_srgb
+    if origin == "model" and raw.xyz_to_camera is not None:
+        return camera_to_srgb(raw.xyz_to_camera)[0]
+    if names == "RGB":
+        return assumed_camera_to_srgb()[0]
+    raise ValueError(f"the capture has no colour matrix for its filters {names}: give a matrix")
 
 
 def matrix_origin(raw: RawCapture) -> str:

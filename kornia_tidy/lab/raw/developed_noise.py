@@ -60,7 +60,7 @@ def developed_noise(
         gains = (factors / factors.min())[[raw.colors.index(letter) for letter in names]].double()
         pairs = profile if len(profile) == len(names) else profile[:1] * len(names)
         slopes, offsets = torch.tensor(pairs, dtype=torch.float64).unbind(1)
-        squares = srgb_matrix(raw, factors).double().square()
+        squares = srgb_matrix(raw).double().square()
         slope = float((squares @ (gains * slopes)).mean())
         dark = float((squares @ (gains.square() * offsets)).mean())
     return SensorNoise(math.sqrt(max(dark, LEAST)), full_well=1 / slope if slope > 0 else None)

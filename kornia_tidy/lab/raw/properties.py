@@ -1,8 +1,6 @@
-"""Properties of a raw capture and of its picture, in words and as plain values."""
+"""Properties of a raw capture and of its picture in words."""
 
 from __future__ import annotations
-
-from typing import Any
 
 from torch import Tensor
 
@@ -57,50 +55,6 @@ def raw_in_words(raw: RawCapture) -> list[tuple[str, str]]:
         ("picture", FLIPS[raw.flip] + aspect),
         *([("opcodes", f"{ignored}: not applied")] if ignored else []),
     ]
-
-
-def raw_properties(raw: RawCapture) -> dict[str, Any]:
-    """Return the properties of a capture as plain values, in SI units, with None for missing ones.
-
-    Example:
-        >>> import torch
-        >>> raw_properties(RawCapture.from_counts(torch.full((1, 2, 4), 64), "RGGB", 64, 1023))["width"]
-        4
-    """
-
-    def plain(tensor: Tensor | None) -> list[Any] | None:
-        return None if tensor is None else tensor.tolist()
-
-    info = raw.info
-    channels, height, width = raw.counts.shape
-    low, high = (end.item() for end in raw.counts.aminmax())
-    return {
-        "make": info.make,
-        "model": info.model,
-        "lens": info.lens,
-        "iso": info.iso,
-        "exposure": info.exposure,
-        "aperture": info.aperture,
-        "focal_length": info.focal_length,
-        "noise_profile": info.noise_profile,
-        "timestamp": info.timestamp.isoformat() if info.timestamp else None,
-        "ignored_opcodes": info.ignored_opcodes,
-        "width": width,
-        "height": height,
-        "channels": channels,
-        "pattern": raw.pattern_letters,
-        "colors": raw.colors,
-        "black": raw.black.tolist(),
-        "white": raw.white,
-        "counts": [low, high],
-        "saturated": _saturated(raw),
-        "white_balance": plain(raw.white_balance),
-        "daylight_balance": plain(raw.daylight_balance),
-        "xyz_to_camera": plain(raw.xyz_to_camera),
-        "camera_to_srgb": plain(raw.camera_to_srgb),
-        "flip": raw.flip,
-        "pixel_aspect": raw.pixel_aspect,
-    }
 
 
 def colors_in_words(raw: RawCapture, demosaic: str | None, balance: str | Tensor | None) -> str:

@@ -1,4 +1,4 @@
-"""Quantised demosaicing: mosaics as unsigned integers for OpenCV and LibRaw, in bands of rows on several threads."""
+"""Quantised demosaicing: mosaics as integers of 16 bits for LibRaw, in bands of rows on several threads."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_finite
 
+HIGHEST = 65535
 ROWS_AT_ONCE = 16  # few enough for intermediate results to stay in the processor's cache
 LARGEST_BAND = 1 << 21  # pixels, 16 MB in LibRaw: malloc reuses such blocks and returns larger ones to the system
 FEWEST_ROWS = 64  # of a band: limits the rows computed twice to a third of a band
@@ -22,7 +23,6 @@ FEWEST_ROWS = 64  # of a band: limits the rows computed twice to a third of a ba
 def demosaic_quantised(
     mosaic: Tensor,
     compute: Callable[[np.ndarray], np.ndarray],
-    bits: int,
     matrix: Tensor,
     reach: int | None = None,
 ) -> Tensor:
@@ -32,8 +32,8 @@ def demosaic_quantised(
 
     Args:
         mosaic: (N, H, W), finite.
-        compute: the algorithm, (rows, W) to (rows, W, colors), unsigned integers; called by several threads at once.
-        bits: 8 or 16.
+        compute: the algorithm, (rows, W) to (rows, W, colors), unsigned integers of 16 bits. Several threads call it
+            at once.
         matrix: (C, colors), applied to the colours during their conversion back to real values.
         reach: number of rows, even, that influence a row on either side. Bands of rows are then computed in parallel
             with the same result. None: the algorithm has no bounded reach, and the whole mosaic is one band.
@@ -49,7 +49,7 @@ def demosaic_quantised(
     if not math.isfinite(high - low):
         check_finite("mosaic", mosaic)  # names the value
     low, high = min(0.0, low), max(1.0, high)
-    step = (high - low) / (2**bits - 1)
+    step = (high - low) / HIGHEST
     height, width = tensor.shape[-2:]
     # Allocated by PyTorch: NumPy requests huge pages, which cost up to seven times as much in fragmented memory.
     image = torch.empty(len(tensor), len(matrix), height, width, dtype=tensor.dtype)
@@ -60,7 +60,7 @@ def demosaic_quantised(
     def work(place: tuple[int, tuple[int, int]]) -> None:
         index, (top, bottom) = place
         first, last = max(top - (reach or 0), 0), min(bottom + (reach or 0), height)
-        counts = _counts(tensor[index, first:last].numpy(), low, step, bits)
+        counts = _counts(tensor[index, first:last].numpy(), low, step)
         _restore(compute(counts)[top - first : bottom - first], back, image[index, :, top:bottom].numpy())
 
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:
@@ -83,8 +83,8 @@ def band_edges(height: int, width: int, threads: int) -> list[int]:
     return [ROWS_AT_ONCE * (height * band // (ROWS_AT_ONCE * bands)) for band in range(bands)] + [height]
 
 
-def _counts(values: np.ndarray, low: float, step: float, bits: int) -> np.ndarray:
-    counts = np.empty(values.shape, np.uint8 if bits == 8 else np.uint16)
+def _counts(values: np.ndarray, low: float, step: float) -> np.ndarray:
+    counts = np.empty(values.shape, np.uint16)
     for top in range(0, len(values), ROWS_AT_ONCE):
         rows = slice(top, top + ROWS_AT_ONCE)
         scaled = values[rows] - low

@@ -98,20 +98,16 @@ class TestMasks(BaseTester):
         assert [float(row["start_ms"]) for row in rows] == pytest.approx([0, 27.5, 55])
         assert [float(row["swap_ms"]) for row in rows] == pytest.approx([10, 10, 10])
 
-    def test_feature_heights_and_stl(self, folder):
+    @pytest.mark.usefixtures("folder")
+    def test_feature_heights(self):
         assert run("export camera.safetensors -o out.npy") == 0
         assert np.load("out.npy").shape == (3, 23, 23)
-        assert run("export heights.npy -o out.stl --mask 1 --pupil-radius 2e-3 --base 5e-4") == 0
-        data = (folder / "out.stl").read_bytes()
-        triangles = np.frombuffer(data[84:], np.uint8).reshape(-1, 50)
-        z = np.ascontiguousarray(triangles[:, :48]).view("<f4").reshape(-1, 4, 3)[:, 1:, 2]
-        assert z.max() == pytest.approx(0.5 + 1e3 * np.load("heights.npy")[1].max(), abs=1e-7)
 
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
             ("show none.npy", "cannot read none.npy: there is no such file"),
-            ("export heights.npy -o slm.png", "the suffix of what to write must be one of '', '.npy', '.stl'"),
+            ("export heights.npy -o slm.png", "the suffix of what to write must be one of '', '.npy'"),
             ("export heights.npy -o none/slm", "cannot write none/slm: there is no folder none"),
             ("export heights.npy -o taken", "cannot write taken: it exists, and --force was not given"),
             ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no file of a folder of frames"),
@@ -139,9 +135,6 @@ class TestMasks(BaseTester):
             ("export heights.npy -o slm --dwell 1 2 3", "there are 3 dwell shares for 2 masks"),
             ("export heights.npy -o slm --switching-time 0.2", "must fit into the exposure of 100 ms"),
             ("export heights.npy -o slm --wavelength 1e-7 --material pmma", "published for 420 to 1620 nm"),
-            ("export heights.npy -o m.stl", "an STL file needs --pupil-radius"),
-            ("export heights.npy -o m.stl --pupil-radius 1e-3", "--mask must be from 0 to 1, got None"),
-            ("export heights.npy -o m.stl --pupil-radius 1e-3 --mask 2", "--mask must be from 0 to 1, got 2"),
             ("import taken", "cannot read taken/frames.json: there is no such file"),
             ("import taken -o x.stl", "the suffix of what to write must be one of '.npy', '.safetensors'"),
             ("import taken -o heights.npy", "cannot write heights.npy: it exists"),

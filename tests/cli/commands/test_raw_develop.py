@@ -53,14 +53,13 @@ class TestRawDevelop(BaseTester):
         assert (preview - develop(raw).clamp(0, 1)).mean().abs() < 0.02  # JPEG of noise, encoded
 
     def test_feature_options_reach_the_picture(self, files, tmp_path):
-        options = "--demosaic half --white-balance 2 1 1.5 --highlights keep --adaptation CAT16 --no-preview"
+        options = "--demosaic half --white-balance 2 1 1.5 --highlights keep --no-preview"
         assert main(["raw", "develop", files[2], "-o", str(tmp_path), *options.split()]) == 0
         expected = develop(
             RawCapture.open(files[2]),
             "half",
             white_balance=torch.tensor([2.0, 1.0, 1.5]),
             highlights="keep",
-            adaptation="CAT16",
         )
         self.assert_close(read_image(tmp_path / "c.png"), expected.clamp(0, 1), atol=1 / 65535)
         assert not (tmp_path / "c.jpg").exists()

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -57,16 +55,6 @@ class TestRawInfo(BaseTester):
             "kornia-tidy: error: 2 of 4 files failed",
         ]
 
-    def test_feature_json(self, folder, capsys):
-        assert run("info --json good.dng short.dng") == 2
-        good, short = json.loads(capsys.readouterr().out)
-        assert (good["file"], good["pattern"], good["width"], good["flip"]) == ("good.dng", "RGGB", 48, 6)
-        assert (good["exposure"], good["black"], good["counts"]) == (0.04, [[64, 64], [64, 64]], [64, 999])
-        assert short == {
-            "file": "short.dng",
-            "error": "cannot read short.dng: it is cut short, 9 bytes of its picture are missing",
-        }
-
     @pytest.mark.filterwarnings("default::UserWarning")
     def test_feature_opcodes_that_are_not_applied(self, folder, capsys):
         counts = np.random.default_rng(0).integers(64, 1000, (36, 48))
@@ -75,8 +63,6 @@ class TestRawInfo(BaseTester):
         told = capsys.readouterr()
         assert "opcodes   GainMap (optional): not applied\n" in told.out
         assert told.err.count("warning: phone.dng: its opcodes GainMap (optional) are not applied") == 1
-        assert run("info --json phone.dng") == 0
-        assert json.loads(capsys.readouterr().out)[0]["ignored_opcodes"] == ["GainMap (optional)"]
 
     def test_feature_floating_point_samples(self, folder, capsys):
         counts = np.random.default_rng(0).integers(64, 1000, (36, 48))

@@ -144,13 +144,12 @@ class TestRawReconstruct(BaseTester):
         assert reconstruct([capture(tmp_path / "a.png")], weights, tmp_path / "out", "--format", "tiff") == 0
         assert sorted(contents(tmp_path / "out")) == ["a.jpg", "a.json", "a.tif"]
 
-    @pytest.mark.parametrize("jobs", ["1", "3"])
-    def test_feature_a_bad_file_does_not_stop_the_rest(self, batch, jobs, capsys):
+    def test_feature_a_bad_file_does_not_stop_the_rest(self, batch, capsys):
         files, weights, folder = batch
         bad = [str(folder.parent / name) for name in ("bad.png", "cut.dng", "missing.png")]
         for path, start in zip(bad[:2], (b"no picture", raw_file()[:5000]), strict=True):
             Path(path).write_bytes(start)
-        assert reconstruct([files[0], *bad, *files[1:]], weights, folder, "--jobs", jobs) == 2
+        assert reconstruct([files[0], *bad, *files[1:]], weights, folder) == 2
         out, err = capsys.readouterr()
         assert {path.stem for path in folder.glob("*.json")} == {"a", "b", "c"}
         lines = [line.split(maxsplit=1) for line in out.splitlines()[1:-1] if not line.startswith("note")]
@@ -176,10 +175,10 @@ class TestRawReconstruct(BaseTester):
         assert "out of memory allocated 5 of 4 GiB\n" in capsys.readouterr().out
         assert {path.stem for path in folder.glob("*.json")} == {"a", "c"}
 
-    def test_feature_jobs_do_not_change_results(self, batch):
+    def test_feature_memory_does_not_change_results(self, batch):
         files, weights, folder = batch
         """Which share the memory, so that the tiles of one are as small; they differ from the whole by rounding."""
-        assert reconstruct(files, weights, folder, "--jobs", "3", "--memory", "3") == 0
+        assert reconstruct(files, weights, folder, "--memory", "3") == 0
         assert reconstruct(files, weights, folder.with_name("alone"), "--memory", "1") == 0
         assert contents(folder) == contents(folder.with_name("alone"))
 
@@ -310,7 +309,7 @@ class TestRawReconstruct(BaseTester):
             path.write_bytes(raw_file((300, 400), i))
         folder = tmp_path / "out"
         command = [sys.executable, "-m", "kornia_tidy", "raw", "reconstruct", *map(str, files), "--head"]
-        command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder), "--jobs", "2"]
+        command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder)]
         before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
         process = subprocess.Popen(
             [*command, "--resume"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True

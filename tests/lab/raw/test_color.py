@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.lab.raw.color import (
-    ADAPTATIONS,
     ASSUMED_CAMERA,
     SRGB_FROM_XYZ,
-    adapted_to_srgb,
     assumed_camera_to_srgb,
     camera_to_srgb,
 )
@@ -88,33 +86,3 @@ class TestAssumedCamera(BaseTester):
         assert colour.delta_E(true, ours).mean() < 2.5
         assert colour.delta_E(true, ours).max() < 7
         assert colour.delta_E(true, plain).mean() > 6
-
-
-class TestAdaptedToSrgb(BaseTester):
-    @pytest.mark.parametrize("adaptation", ADAPTATIONS)
-    @pytest.mark.parametrize("light", ["A", "FL2", "D50"])
-    def test_feature_as_colour_science_for_a_camera_that_sees_xyz(self, adaptation, light):
-        """Such a camera's counts are XYZ: colour-science adapts them from the light's white to daylight's."""
-        matrix, daylight = camera_to_srgb(torch.eye(3, dtype=torch.float64))
-        xy = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"][light]
-        white = colour.xy_to_XYZ(xy)
-        seen = np.random.default_rng(0).uniform(0, 1, (20, 3))
-        factors = torch.as_tensor(1 / white)
-        ours = seen * factors.numpy() @ adapted_to_srgb(matrix, daylight, factors, adaptation).numpy().T
-        adapted = colour.chromatic_adaptation(seen, white, D65, method="Von Kries", transform=adaptation)
-        assert np.abs(ours - adapted @ np.array(SRGB_FROM_XYZ).T).max() < 1e-6
-
-    @pytest.mark.parametrize("xyz_to_camera", [G2, G1])
-    def test_feature_white_stays_white_and_daylight_changes_nothing(self, xyz_to_camera):
-        matrix, daylight = camera_to_srgb(tensor(xyz_to_camera))
-        tungsten = daylight * torch.linspace(0.6, 1.8, len(daylight), dtype=torch.float64)
-        adapted = adapted_to_srgb(matrix, daylight, tungsten, "Bradford")
-        self.assert_close(adapted.sum(1), torch.ones(3), atol=1e-5)
-        self.assert_close(adapted_to_srgb(matrix, daylight, 3 * daylight, "CAT16"), matrix, atol=1e-5)
-
-    def test_exception(self):
-        matrix, daylight = camera_to_srgb(tensor(G2))
-        with pytest.raises(ValueError, match="chromatic adaptation must be one of 'Bradford'"):
-            adapted_to_srgb(matrix, daylight, daylight, "none")
-        with pytest.raises(ValueError, match="belongs to no illuminant: its XYZ is"):
-            adapted_to_srgb(matrix, daylight, torch.tensor([1.0, 1.0, 1e-3]), "Bradford")

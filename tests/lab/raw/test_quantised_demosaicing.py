@@ -60,14 +60,14 @@ class TestInWholeNumbers(BaseTester):
 
     def test_feature_values_come_back_to_half_a_step(self):
         mosaic = torch.rand(2, 130, 8) * 3 - 1
-        image = demosaic_quantised(mosaic, thrice, 16, torch.eye(3), 0)
+        image = demosaic_quantised(mosaic, thrice, torch.eye(3), 0)
         step = float(mosaic.max() - mosaic.min()) * ONE_COUNT
         assert (image[:, 0] - mosaic).abs().max() <= 0.505 * step
         low = float(mosaic.min())
         assert (image[:, 1] - (mosaic + low) / 2).abs().max() <= 0.755 * step  # of whole numbers, rounded down
         assert (image[:, 2] - low).abs().max() < 1e-6
 
-    @pytest.mark.parametrize(("letters", "name"), [("BGGR", "libraw_ahd"), ("GRBG", "opencv_edge_aware")])
+    @pytest.mark.parametrize(("letters", "name"), [("BGGR", "libraw_ahd"), ("GRBG", "libraw_vng")])
     def test_feature_the_matrix_on_the_way_back_is_the_matrix_afterwards(self, letters, name, dtype):
         """By float64 from the same colours: a twentieth of a count of 16 bits, or the dtype's own last bit."""
         mosaic = torch.rand(1, 40, 50, dtype=dtype) * 1.25 - 0.125
@@ -109,20 +109,20 @@ class TestInWholeNumbers(BaseTester):
         mosaic = torch.rand(1, 8, 8)
         mosaic[0, 3, 4] = value
         with pytest.raises(ValueError, match=f"mosaic must be finite, got {value}"):
-            demosaic_quantised(mosaic, thrice, 16, torch.eye(3))
+            demosaic_quantised(mosaic, thrice, torch.eye(3))
 
     def test_exception_of_a_thread_comes_here(self):
         def fails(counts):
             raise RuntimeError(f"no {counts.shape}")
 
         with pytest.raises(RuntimeError, match=r"no \(8, 8\)"):
-            demosaic_quantised(torch.rand(1, 8, 8), fails, 16, torch.eye(3))
+            demosaic_quantised(torch.rand(1, 8, 8), fails, torch.eye(3))
 
-    def test_cardinality_eight_bits_and_half_precision(self):
+    def test_cardinality_half_precision(self):
         mosaic = torch.rand(3, 10, 12, dtype=torch.float16)
-        image = demosaic_quantised(mosaic, thrice, 8, torch.eye(3))
+        image = demosaic_quantised(mosaic, thrice, torch.eye(3))
         assert (image.shape, image.dtype) == ((3, 3, 10, 12), torch.float16)
-        assert (image[:, 0] - mosaic).abs().max() < 0.51 / 255 + 1e-3
+        assert (image[:, 0] - mosaic).abs().max() < 1e-3
 
     def test_gradcheck_of_the_matrix_after_methods_of_real_numbers(self):
         matrix = torch.tensor([[1.0, 0.5, 0], [0, 1, 0], [0.5, 0, 2]])
