@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_positive
-from kornia_tidy.masks.base import MASK_SPAN, central_square, mask_coordinates
+from kornia_tidy.masks.base import central_square
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.propagation import sensor_kernels
 from kornia_tidy.psf.psf_model import PSFModel
@@ -94,44 +94,6 @@ def defocus_response(lens: PSFModel, defocus: Sequence[float] | None = None) -> 
         torch.einsum("wdyx,cw->dcyx", torch.stack(psfs), channel_weights),
         torch.einsum("wsdyx,cw->sdcyx", torch.stack(derivatives), channel_weights),
     )
-
-
-def sampled_response(
-    phase: Tensor, aperture: Tensor, defocus: Sequence[float], samples: int = 64, weights: Tensor | None = None
-) -> PointResponse:
-    r"""Return PSFs and their derivatives in the published setting of depth masks: a point-sampled pupil and one FFT.
-
-    .. math:: h_d = \frac{|\mathrm{FFT}_M\{A e^{i\phi + i\psi_d \rho^2}\}|^2}{M^2 \sum A^2}
-
-    Bounds from these PSFs compare with published ones. They are about 5 % too low, for two reasons: real mask pixels
-    have a width and scatter light far out, which point samples do not; and light beyond the M x M pixels is aliased
-    back into them.
-
-    Args:
-        phase: radians at 530 nm, (K, N, N); the PSFs are averaged over the K masks.
-        aperture: amplitude, (N, N).
-        defocus: nodes in radians.
-        samples: M, pixels along a side of the PSF.
-        weights: fraction of the exposure of each mask, (K,). Default: equal.
-
-    Returns:
-        PSFs of one channel and derivatives in float64. For N = 23 a pixel is 10 / M cycles per pupil radius.
-
-    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3.
-
-    Example:
-        >>> from kornia_tidy.optics.aperture import circular_aperture
-        >>> psfs, _ = sampled_response(torch.zeros(1, 23, 23), circular_aperture(23), [0.0])
-        >>> psfs.shape, round(float(psfs.sum()), 9)
-        (torch.Size([1, 1, 64, 64]), 1.0)
-    """
-    count, size = phase.shape[0], phase.shape[-1]
-    amplitude = aperture.to(phase.device, torch.float64)
-    weights = phase.new_full((count,), 1 / count, dtype=torch.float64) if weights is None else weights.double()
-    kernels, step = _sampled_kernels(tuple(map(float, defocus)), samples, size, phase.device)
-    field = pupil_field(phase.double(), amplitude, 1.0)
-    psfs, derivatives = _energies(field, weights / amplitude.square().sum(), kernels, step)
-    return PointResponse(psfs[:, None], derivatives[:, :, None])
 
 
 def fisher_information(response: PointResponse, photons: float = PHOTONS, background: float = BACKGROUND) -> Tensor:
@@ -269,17 +231,3 @@ def _exact_kernels(
     spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
     with torch.inference_mode(False), torch.no_grad():
         return torch.stack([sensor_kernels(defocus, step, *geometry, device, spans, m) for m in (0, 1, 2)])
-
-
-@lru_cache(maxsize=12)
-def _sampled_kernels(defocus: tuple[float, ...], samples: int, size: int, device: torch.device) -> tuple[Tensor, float]:
-    """Return the matrices of an FFT of pupil samples, normalised by sqrt(M), and the pixel in cycles per radius."""
-    pitch = MASK_SPAN / size
-    step = 1 / (samples * pitch)
-    with torch.inference_mode(False), torch.no_grad():
-        x = mask_coordinates(size).to(device)
-        u = (torch.arange(samples, dtype=torch.float64, device=device) - samples // 2) * step
-        psi = torch.tensor(defocus, dtype=torch.float64, device=device)
-        angle = psi[:, None, None] * x**2 - 2 * math.pi * u[:, None] * x
-        kernel = torch.exp(1j * angle) / math.sqrt(samples)
-        return torch.stack([kernel * x**moment for moment in (0, 1, 2)])[:, :, :, None], step

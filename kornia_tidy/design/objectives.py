@@ -7,7 +7,6 @@ is :func:`restoration_error`, or :func:`point_error` if the image is not restore
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,10 +16,7 @@ from torch.nn import functional
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
-from kornia_tidy.design.fisher_information import defocus_bound, fisher_information, sampled_response
 from kornia_tidy.masks.base import PhaseMasks, adam_groups
-from kornia_tidy.masks.zernike import ZernikeMask
-from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.sensor.sensor import SensorNoise
@@ -195,47 +191,3 @@ def _light_around(statistics: SceneStatistics, size: int) -> Tensor:
 
 def _squared(spectrum: Tensor) -> Tensor:
     return spectrum.real.square() + spectrum.imag.square()
-
-
-def design_fisher_mask(
-    limit: float = 10.0, seed: int = 0, size: int = 23, num_modes: int = 55, iterations: int = 150
-) -> tuple[ZernikeMask, float]:
-    """Design a mask for depth estimation in the published setting, by its mean Cramér-Rao bound over defocus.
-
-    The bound is that of :func:`sampled_response` at 21 depths, with 3000 photons, a background of 5 photons in each of
-    64 x 64 pixels, and unknown defocus and position. For another range, camera or spectrum, :func:`design` the masks of
-    a lens by its :func:`~kornia_tidy.design.fisher_information.crlb`.
-
-    Args:
-        limit: largest defocus in radians on either side of focus; beyond 10 rad light leaves the 64 x 64 pixels.
-        seed: seed of the initial Zernike coefficients, 0.5 rad rms in all.
-        size: pixels along a side of the mask.
-        num_modes: number of Zernike polynomials.
-        iterations: gradient steps; 150 take 4 s on one core.
-
-    Returns:
-        The mask, and its mean bound in radians. With the defaults this is 0.0668 to 0.0671 for seeds 0 to 5.
-
-    Raises:
-        ValueError: if ``limit`` or ``iterations`` is not positive.
-
-    Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for a mask designed in this way, with a bound of 0.0785;
-    Shechtman et al., Physical Review Letters 113, 133902 (2014), for the resulting tetrapod PSF.
-
-    Example:
-        >>> mask, bound = design_fisher_mask(iterations=2)
-        >>> mask.phase.shape, bound < 1
-        (torch.Size([1, 23, 23]), True)
-    """
-    check_positive("limit", limit, "radians")
-    generator = torch.Generator().manual_seed(seed)
-    start = 0.5 / math.sqrt(num_modes) * torch.randn(num_modes, generator=generator, dtype=torch.float32)
-    mask = ZernikeMask(1, size, num_modes, initial=start).double()
-    aperture = circular_aperture(size, 2.3 / size)
-    nodes = torch.linspace(-limit, limit, 21, dtype=torch.float64).tolist()
-
-    def mean_bound() -> Tensor:
-        return defocus_bound(fisher_information(sampled_response(mask.phase, aperture, nodes))).mean()
-
-    design(mask, mean_bound, iterations, lr_metres=8.4e-9)
-    return mask, float(mean_bound().detach())

@@ -20,7 +20,8 @@ NOISE_MEAN, NOISE_STD = 5.35e-7, 3.05e-7  # m; of the noise on Fisher masks in t
 SWEEP = (0.0, -8.0, 8.0, -16.0, 16.0)  # rad; defocus at which each of the five masks is in focus
 SMALL_NOISE = 6e-8  # m; breaks the symmetry: without it lenses stay round and equal masks stay equal
 
-# Result of design_fisher_mask(seed=3): radians rms of 55 Zernike polynomials in the order of OSA/ANSI.
+# Result of design_fisher_mask(seed=3) in tests/design/published_setting.py: radians rms of 55 Zernike polynomials in
+# the order of OSA/ANSI.
 # fmt: off
 FISHER_COEFFICIENTS = (
     -0.0056, 0.2993, -0.2471, 0.7524, 0.0021, -0.0805, 0.0000, 0.0000, 0.0001, 0.0000, 0.0000,
@@ -35,8 +36,6 @@ FISHER_COEFFICIENTS = (
 def fisher_mask(size: int = 23) -> Tensor:
     """Return the Fisher mask, a mask designed for depth estimation by the Cramér-Rao bound.
 
-    It is the result of :func:`~kornia_tidy.design.objectives.design_fisher_mask` with seed 3.
-
     Args:
         size: pixels N along a side.
 
@@ -45,8 +44,8 @@ def fisher_mask(size: int = 23) -> Tensor:
 
     Convention:
         - In the published setting its bound on the error of defocus is 0.0668 rad on average over -10 to 10 rad. That
-          of the mask published with PhaseCam3D is 0.0785 rad. See
-          :func:`~kornia_tidy.design.fisher_information.sampled_response`.
+          of the mask published with PhaseCam3D is 0.0785 rad. In that setting the pupil is sampled at points, and one
+          FFT of 64 x 64 pixels gives the PSF; bounds in it are about 5 % too low.
 
     Source: Wu et al., PhaseCam3D (ICCP 2019), section 3, for the method; the mask is our own.
 

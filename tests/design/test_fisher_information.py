@@ -16,7 +16,6 @@ from kornia_tidy.design.fisher_information import (
     defocus_bound,
     defocus_response,
     fisher_information,
-    sampled_response,
 )
 from kornia_tidy.masks import CubicMask, PhaseMasks, ZernikeMask
 from kornia_tidy.masks.initial_heights import fisher_mask
@@ -25,6 +24,7 @@ from kornia_tidy.optics import ThinLensCamera, circular_aperture
 from kornia_tidy.optics.materials import PMMA
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester, shared
+from tests.design.published_setting import sampled_response
 
 APERTURE = circular_aperture(23)
 FINE = Fidelity("fine", pixel_tolerance=1e-4, window=25, stray_light="discard", double=True)

@@ -10,12 +10,13 @@ import torch
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, SensorNoise, Spectrum
 from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.design.fisher_information import crlb
-from kornia_tidy.design.objectives import design, design_fisher_mask, point_error, restoration_error
+from kornia_tidy.design.objectives import design, point_error, restoration_error
 from kornia_tidy.masks import CubicMask
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
+from tests.design.published_setting import design_fisher_mask
 
 COARSE = Fidelity("coarse", pixel_tolerance=0.1, window=33, stray_light="discard")
 
@@ -74,10 +75,6 @@ class TestFisherDesign(BaseTester):
         (first, one), (again, same), (_, other) = (design_fisher_mask(seed=s, iterations=3) for s in (0, 0, 1))
         assert torch.equal(first.phase, again.phase)
         assert one == same != other
-
-    def test_exception_limit(self):
-        with pytest.raises(ValueError, match="limit must be positive and finite radians, got -1"):
-            design_fisher_mask(limit=-1)
 
 
 class TestPointError(BaseTester):

@@ -5,10 +5,10 @@ import torch
 
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.choices import STARTS
-from kornia_tidy.design.objectives import design_fisher_mask
 from kornia_tidy.masks.initial_heights import CLEAN, SMALL_NOISE, SWEEP, fisher_mask, initial_heights
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
+from tests.design.published_setting import design_fisher_mask
 
 
 def drawn(start, seed=0):
