@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from kornia_tidy.choices import MASK_FAMILIES
 from kornia_tidy.cli.commands.shared import Folder, OwnScene, check_folder
@@ -67,7 +67,7 @@ class Demo:
         folder = check_folder(self.output)
         import torch
 
-        from kornia_tidy.cli.commands.report import Stages, clamped_in_words, progress_bar, scene_in_words, tell
+        from kornia_tidy.cli.commands.report import clamped_in_words, progress_bar, scene_in_words, tell
         from kornia_tidy.design.compared_cameras import photograph, stopped_down
         from kornia_tidy.figures.demonstration import (
             comparison_page,
@@ -82,37 +82,27 @@ class Demo:
         from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 
         require_matplotlib()
-        stages = Stages()
-        progress = progress_bar("demo", total=6, bar_format="{desc}: {bar} {n}/{total} {postfix}")
-
-        def step(name: str) -> Any:
-            progress.update(int(bool(stages.seconds)))
-            progress.set_postfix_str(name)
-            return stages(name)
-
-        with torch.no_grad(), progress:
-            with step("scene"):
-                cameras = self._cameras()
-                lens = cameras["coded"].optics.camera
-                assert isinstance(lens, ThinLensCamera)  # as in the training of the systems
-                scene = self._scene(lens)
-                near = normalised_inverse_depth(lens, scene.depth)
-            with step("search"):
-                if "flat" not in cameras:
-                    cameras["flat"] = stopped_down(lens, self.electrons)
+        with torch.no_grad(), progress_bar("demo", total=5) as progress:
+            cameras = self._cameras()
+            lens = cameras["coded"].optics.camera
+            assert isinstance(lens, ThinLensCamera)  # as in the training of the systems
+            scene = self._scene(lens)
+            near = normalised_inverse_depth(lens, scene.depth)
+            progress.update()
+            if "flat" not in cameras:
+                cameras["flat"] = stopped_down(lens, self.electrons)
+            progress.update()
             results: dict[str, Result] = {}
             for name in ("coded", "flat", "joint"):
                 if name in cameras:
-                    with step(name):
-                        results[name] = photograph(cameras[name], scene, self.seed)
-            with step("pages"):
-                pages = {
-                    "demo.png": explained_page(cameras["coded"], scene, results["coded"], self.seed),
-                    "reconstruction.png": comparison_page(cameras, results, scene, near, self.electrons),
-                }
-        with stages("write"):
-            pictures = pictures_of(results, scene, near)
-            _write(folder, pictures, pages)
+                    results[name] = photograph(cameras[name], scene, self.seed)
+                progress.update()
+            pages = {
+                "demo.png": explained_page(cameras["coded"], scene, results["coded"], self.seed),
+                "reconstruction.png": comparison_page(cameras, results, scene, near, self.electrons),
+            }
+        pictures = pictures_of(results, scene, near)
+        _write(folder, pictures, pages)
 
         tell("scene", scene_in_words(scene))
         tell("light", light_in_words(cameras, self.electrons))
@@ -124,7 +114,6 @@ class Demo:
         tell("", f"{folder / 'demo.png'}: how the masks make a capture")
         for name in pictures:
             tell("", str(folder / name))
-        tell("time", stages.summary())
 
     def _cameras(self) -> dict[str, Camera]:
         """Return the shipped cameras, or the one that is made up in place of that with masks."""

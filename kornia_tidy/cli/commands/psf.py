@@ -104,7 +104,7 @@ class Psf:
         """Compute the PSFs, print their numbers and draw them."""
         import torch
 
-        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.figures.field import airy_radius, draw_field
         from kornia_tidy.figures.field_measures import heights_to_corner, measures_over_field
         from kornia_tidy.figures.psf import draw_psfs
@@ -115,24 +115,19 @@ class Psf:
             raise ValueError("there is no camera: give CAMERA, --lens, or both")
         check_output(self.output, self.camera, self.lens)
         require_matplotlib()
-        stages = Stages()
-        with torch.no_grad(), stages("camera"):
+        with torch.no_grad():
             optics = self._optics()
             psi = self._defocus(optics)
         if self.field is None:
-            with stages("PSFs"):
-                measured = measures_of_psfs(optics, psi)
+            measured = measures_of_psfs(optics, psi)
             name = Path(self.camera or self.lens or "").name
             title = f"PSFs of {name}, window {optics.window} x {optics.window} px"
-            with stages("picture"):
-                save_figure(self.output, draw_psfs(measured, title))
+            save_figure(self.output, draw_psfs(measured, title))
         else:
             if optics.lens is None:
                 raise ValueError(f"--field is for a camera with a lens, and {self.camera} has none: give it --lens")
-            with stages("PSFs"):
-                measured = measures_over_field(optics, heights_to_corner(optics.lens, self.field), psi)
-            with stages("picture"):
-                save_figure(self.output, draw_field(measured, airy_radius(optics)), dpi=100)
+            measured = measures_over_field(optics, heights_to_corner(optics.lens, self.field), psi)
+            save_figure(self.output, draw_field(measured, airy_radius(optics)), dpi=100)
         tell("camera", optics.camera.extra_repr())
         if optics.lens is not None:
             tell("lens", optics.lens.extra_repr())
@@ -140,7 +135,6 @@ class Psf:
         tell("window", f"{optics.window} x {optics.window} px, fidelity {optics.fidelity.name!r}")
         print("", *measured.table(), "", sep="\n")
         tell("wrote", f"{self.output}: look at it")
-        tell("time", stages.summary())
 
     def _optics(self) -> TiDyOptics:
         """Return the camera, with stray light discarded so that the ensquared energy can be measured."""

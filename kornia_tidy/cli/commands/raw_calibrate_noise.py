@@ -59,24 +59,19 @@ In Python:
         output = Path(self.output)
         plot = None if self.plot is None else Path(self.plot or output.with_suffix(".png"))
         _check_outputs(output, plot, [*self.files, *self.dark])
-        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.figures.style import save_figure
         from kornia_tidy.figures.transfer import draw_transfer
         from kornia_tidy.lab.calibration.noise.photon_transfer import photon_transfer, write_json
 
-        stages = Stages()
-        with stages("read"):
-            captures, darks = ([self.dump.open(path) for path in paths] for paths in (self.files, self.dark))
-        with stages("measure"):
-            result = photon_transfer(captures, darks)
-        with stages("write"):
-            write_json(output, result)
-            if plot is not None:
-                save_figure(plot, draw_transfer(result))
+        captures, darks = ([self.dump.open(path) for path in paths] for paths in (self.files, self.dark))
+        result = photon_transfer(captures, darks)
+        write_json(output, result)
+        if plot is not None:
+            save_figure(plot, draw_transfer(result))
         for topic, text in result.in_words():
             tell(topic, text)
         tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
-        tell("time", stages.summary())
 
 
 def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:

@@ -99,7 +99,7 @@ In Python:
     def run(self) -> None:
         """Measure the PSFs and write the bank."""
         self._check()
-        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.lab.calibration.psf.measured_psfs import channel_cutoffs, measure_psfs
         from kornia_tidy.lab.calibration.psf.point_files import images_of_files
         from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -109,20 +109,18 @@ In Python:
         focus = float(lens.focus_distance)
         camera = ThinLensCamera(lens.focal_length, lens.aperture_diameter, focus, lens.pixel_pitch, depths)
         sensor, calibration = self.sensor.noise_of()
-        stages = Stages()
-        with stages("measure"):
-            images = images_of_files(
-                partial(self._read, calibration=calibration),
-                self.files,
-                self.distances,
-                self.exposures,
-                sensor,
-                window=self.window,
-                points=self.points,
-                references=self.reference,
-            )
-            channels = 1 + max(next(iter(images.values()))[0].channels)
-            measured = measure_psfs(images, camera, self.window, channel_cutoffs(camera, channels), self.diameter)
+        images = images_of_files(
+            partial(self._read, calibration=calibration),
+            self.files,
+            self.distances,
+            self.exposures,
+            sensor,
+            window=self.window,
+            points=self.points,
+            references=self.reference,
+        )
+        channels = 1 + max(next(iter(images.values()))[0].channels)
+        measured = measure_psfs(images, camera, self.window, channel_cutoffs(camera, channels), self.diameter)
         tell("camera", camera.extra_repr())
         for topic, text in measured.in_words():
             tell(topic, text)
@@ -135,8 +133,7 @@ In Python:
             from kornia_tidy.lab.calibration.psf.phase_retrieval import retrieve_mask, spectrum_of
             from kornia_tidy.lab.mask_export.mask_files import write_heights
 
-            with stages("mask"):
-                fit = retrieve_mask(measured.bank, camera, spectrum_of(channels), self.mask_size)
+            fit = retrieve_mask(measured.bank, camera, spectrum_of(channels), self.mask_size)
             for distance, left in zip(measured.distances, fit.residual, strict=True):
                 words = " ".join(f"{100 * float(x):.2g}" for x in left)
                 tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
@@ -148,7 +145,6 @@ In Python:
 
             save_figure(self.picture, draw_measured(measured, fit))
             tell("wrote", self.picture)
-        tell("time", stages.summary())
 
     def _check(self) -> None:
         """Check the settings before any work."""

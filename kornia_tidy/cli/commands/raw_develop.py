@@ -77,7 +77,7 @@ The first example in Python:
         """Develop raw files."""
         import torch
 
-        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.data.image_files import write_image
         from kornia_tidy.lab.file_jobs import for_each_file, output_paths
         from kornia_tidy.lab.raw.develop import develop, encode
@@ -89,7 +89,6 @@ The first example in Python:
         outputs = output_paths(self.files, folder, suffixes)
         folder.mkdir(parents=True, exist_ok=True)
         done = {"developed": 0, "kept": 0}
-        stages = Stages()
 
         def work(path: str) -> None:
             place = f"{list(outputs).index(path) + 1}/{len(outputs)}"
@@ -98,9 +97,8 @@ The first example in Python:
                 done["kept"] += 1
                 tell(place, f"{path}: kept {paths[0]}")
                 return
-            with stages("decode"):
-                raw = self.dump.open(path)
-            with stages("develop"), torch.no_grad():
+            raw = self.dump.open(path)
+            with torch.no_grad():
                 image = develop(
                     raw,
                     self.demosaic,
@@ -112,12 +110,11 @@ The first example in Python:
                 )
                 clipped = clipped_in_words(image)
                 encoded = encode(image.clamp_(0, 1))
-            with stages("write"):
-                for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
-                    if output.suffix == ".jpg":
-                        write_image(output, encoded)
-                    else:
-                        write_image(output, image if self.linear else encoded, bits=16)
+            for output in reversed(paths):  # the preview is written first, so that a picture means that both exist
+                if output.suffix == ".jpg":
+                    write_image(output, encoded)
+                else:
+                    write_image(output, image if self.linear else encoded, bits=16)
             done["developed"] += 1
             tell(
                 place,
@@ -130,4 +127,3 @@ The first example in Python:
         finally:
             missing = len(outputs) - sum(done.values())
             tell("files", f"{done['developed']} developed, {done['kept']} kept, {missing} failed or left")
-            tell("time", stages.summary())

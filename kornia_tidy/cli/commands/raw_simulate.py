@@ -14,7 +14,6 @@ from kornia_tidy.settings import Count, Metres, Seed, Unit, one_of
 if TYPE_CHECKING:
     import torch
 
-    from kornia_tidy.cli.commands.report import Stages
     from kornia_tidy.lab.raw.capture import RawCapture
     from kornia_tidy.sensor.sensor import SensorNoise
 
@@ -123,52 +122,42 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
         self._check(output)
         import torch
 
-        from kornia_tidy.cli.commands.report import Stages, tell
+        from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.lab.raw.dng_file import write_dng
         from kornia_tidy.lab.raw.simulation import simulate_raw
 
-        stages = Stages()
         generator = torch.Generator().manual_seed(self.sensor.seed)
-        with stages("read"):
-            camera = self._camera()
-            noise, calibration = self.sensor.noise_of(16, **USUAL)
-            if calibration is not None and self.sensor.like is not None:
-                calibration.check_taken_alike(camera, self.sensor.like)
+        camera = self._camera()
+        noise, calibration = self.sensor.noise_of(16, **USUAL)
+        if calibration is not None and self.sensor.like is not None:
+            calibration.check_taken_alike(camera, self.sensor.like)
         with torch.no_grad():
             if self.image is not None:
-                raw = self._scene(camera, noise, generator, stages)
+                raw = self._scene(camera, noise, generator)
             else:
-                with stages("capture"):
-                    light = self._target(3 if camera.colors else 1, generator)
-                    raw = simulate_raw(light, camera, noise, color=self._color(), generator=generator)
+                light = self._target(3 if camera.colors else 1, generator)
+                raw = simulate_raw(light, camera, noise, color=self._color(), generator=generator)
         saturated = float((raw.counts >= int(raw.white)).float().mean())
         letters = raw.pattern_letters or "no"
         tell("sensor", f"{letters} filter array, white {raw.white:g}, {saturated:.2%} of the pixels there; {noise}")
-        with stages("write"):
-            write_dng(output, raw)
+        write_dng(output, raw)
         tell("wrote", f"{output}, {raw.counts.shape[-1]} x {raw.counts.shape[-2]} px")
-        tell("time", stages.summary())
 
-    def _scene(self, camera: RawCapture, noise: SensorNoise, generator: torch.Generator, stages: Stages) -> RawCapture:
+    def _scene(self, camera: RawCapture, noise: SensorNoise, generator: torch.Generator) -> RawCapture:
         """Return the capture of a picture with depth."""
         from kornia_tidy.cli.commands.report import clamped_in_words, light_in_words, scene_in_words, tell
         from kornia_tidy.lab.raw.simulation import simulate_scene
 
         assert self.image is not None
         assert self.depth is not None
-        with stages("read"):
-            scene = self.file.read(self.image, self.depth)
+        scene = self.file.read(self.image, self.depth)
         tell("scene", scene_in_words(scene))
-        with stages("PSFs"):
-            optics = self.optics.optics(scene, sensor=None, fidelity=self.fidelity, compositing=self.compositing)
-            bank = optics.psf_bank(channels=3 if camera.colors else 1)
+        optics = self.optics.optics(scene, sensor=None, fidelity=self.fidelity, compositing=self.compositing)
+        bank = optics.psf_bank(channels=3 if camera.colors else 1)
         tell("lens", (optics.camera if optics.lens is None else optics.lens).extra_repr())
         tell("masks", self.optics.in_words(optics))
         tell("PSFs", light_in_words(bank, optics))
-        with stages("capture"):
-            raw = simulate_scene(
-                scene.image, scene.depth, optics, camera, noise, color=self._color(), generator=generator
-            )
+        raw = simulate_scene(scene.image, scene.depth, optics, camera, noise, color=self._color(), generator=generator)
         tell("clamped", clamped_in_words(optics, scene.depth))
         return raw
 

@@ -1,11 +1,8 @@
-"""Report lines of commands: scene, PSFs and clamping in words, and the time of each stage."""
+"""Report lines of commands: scene, PSFs and clamping in words."""
 
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Generator
-from contextlib import contextmanager
 from typing import Any
 
 from torch import Tensor
@@ -14,33 +11,6 @@ from tqdm import tqdm
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.psf.psf_bank import PSFBank
-
-
-class Stages:
-    """Stopwatch for the stages of a command.
-
-    Example:
-        >>> stages = Stages()
-        >>> with stages("read"):
-        ...     pass
-        >>> stages.summary()
-        'read 0.00 s, together 0.00 s'
-    """
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, name: str) -> Generator[None]:
-        """Time a block; blocks with the same name are summed."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-    def summary(self) -> str:
-        """Return the stages and their times in one line."""
-        parts = [f"{name} {seconds:.2f} s" for name, seconds in self.seconds.items()]
-        return ", ".join([*parts, f"together {sum(self.seconds.values()):.2f} s"])
 
 
 def progress_bar(what: str, **options: Any) -> tqdm:

@@ -106,34 +106,31 @@ The first example in Python, the same but for the rounding to 8 bits:
         """Simulate the capture and write it."""
         import torch
 
-        from kornia_tidy.cli.commands.report import Stages, clamped_in_words, light_in_words, scene_in_words, tell
+        from kornia_tidy.cli.commands.report import clamped_in_words, light_in_words, scene_in_words, tell
         from kornia_tidy.data.image_files import write_image
         from kornia_tidy.sensor.sensor import SensorNoise
 
         output = self.output or f"{Path(self.image).stem}_coded.png"
         check_output(output, self.image, self.depth, self.camera.psfs, bits=self.bits)
         sensor, _ = read_noise(self.noise)
-        stages = Stages()
         with torch.no_grad():
-            with stages("read"):
-                scene = self.file.read(self.image, self.depth)
-                if self.holes == "error" and (count := int((~scene.valid).sum())):
-                    raise ValueError(
-                        f"{self.depth} has no depth at {count} of its {scene.valid.numel()} pixels: take it from the "
-                        f"nearest known ones with --holes fill"
-                    )
+            scene = self.file.read(self.image, self.depth)
+            if self.holes == "error" and (count := int((~scene.valid).sum())):
+                raise ValueError(
+                    f"{self.depth} has no depth at {count} of its {scene.valid.numel()} pixels: take it from the "
+                    f"nearest known ones with --holes fill"
+                )
             tell("scene", scene_in_words(scene))
 
-            with stages("PSFs"):
-                optics = self.camera.optics(
-                    scene,
-                    sensor=sensor or SensorNoise(),
-                    fidelity=self.fidelity,
-                    compositing=self.compositing,
-                    color_space=self.color_space,
-                    border=self.border,
-                )
-                bank = optics.psf_bank(channels=scene.image.shape[0])
+            optics = self.camera.optics(
+                scene,
+                sensor=sensor or SensorNoise(),
+                fidelity=self.fidelity,
+                compositing=self.compositing,
+                color_space=self.color_space,
+                border=self.border,
+            )
+            bank = optics.psf_bank(channels=scene.image.shape[0])
             tell("camera", optics.camera.extra_repr())
             if optics.lens is not None:
                 tell("lens", optics.lens.extra_repr())
@@ -143,10 +140,7 @@ The first example in Python, the same but for the rounding to 8 bits:
                 "capture", f"{optics.compositing}, {optics.border} border, {optics.color_space} colour, {optics.sensor}"
             )
 
-            with stages("capture"):
-                coded = optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(self.seed))
+            coded = optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(self.seed))
         tell("clamped", clamped_in_words(optics, scene.depth))
-        with stages("write"):
-            write_image(output, coded, bits=self.bits)
+        write_image(output, coded, bits=self.bits)
         tell("wrote", f"{output}, {coded.shape[-1]} x {coded.shape[-2]} px, {self.bits} bits")
-        tell("time", stages.summary())

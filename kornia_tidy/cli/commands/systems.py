@@ -72,7 +72,7 @@ class Systems:
         import torch
 
         from kornia_tidy.camera.tidy_optics import TiDyOptics
-        from kornia_tidy.cli.commands.report import Stages, progress_bar, tell
+        from kornia_tidy.cli.commands.report import progress_bar, tell
         from kornia_tidy.figures.style import require_matplotlib, save_figure
         from kornia_tidy.figures.system_statistics import system_statistics
         from kornia_tidy.figures.systems import Portrait, draw_systems
@@ -81,30 +81,24 @@ class Systems:
 
         systems = [published_system(name) for name in self.systems or SYSTEMS]
         require_matplotlib()
-        stages, portraits = Stages(), []
+        portraits = []
         progress = progress_bar("systems", iterable=systems, unit="system")
         with torch.no_grad(), progress:
-            with stages("scene"):
-                image, inverse_depth, scene = self._scene()
+            image, inverse_depth, scene = self._scene()
             for system in progress:
                 progress.set_postfix_str(system.name)
-                with stages("cameras"):
-                    camera = system.camera()
-                    masks = torch.Generator().manual_seed(self.seed)
-                    optics = TiDyOptics.from_preset(system.name, generator=masks, camera=camera)
-                with stages("statistics"):
-                    seen = system_statistics(optics.psf_model)
-                with stages("captures"):
-                    generator = torch.Generator().manual_seed(self.seed)
-                    capture = optics(image, metres(camera, inverse_depth), generator=generator)
+                camera = system.camera()
+                masks = torch.Generator().manual_seed(self.seed)
+                optics = TiDyOptics.from_preset(system.name, generator=masks, camera=camera)
+                seen = system_statistics(optics.psf_model)
+                generator = torch.Generator().manual_seed(self.seed)
+                capture = optics(image, metres(camera, inverse_depth), generator=generator)
                 portraits.append(Portrait(system, optics, seen, capture))
-            with stages("picture"):
-                figure = draw_systems(portraits, image, inverse_depth, scene)
-                save_figure(self.output, figure, DOTS_PER_INCH)
+            figure = draw_systems(portraits, image, inverse_depth, scene)
+            save_figure(self.output, figure, DOTS_PER_INCH)
         print("\n".join(systems_table([portrait.system for portrait in portraits])))
         print()
         tell("wrote", f"{self.output}: look at it")
-        tell("time", stages.summary())
 
     def _scene(self) -> tuple[Tensor, Tensor, str]:
         """Return an RGB image, its normalised inverse depth in [0, 1], and its name."""
