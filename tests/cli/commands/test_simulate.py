@@ -49,7 +49,6 @@ class TestSimulate(BaseTester):
             "5 learnable masks",
             "px holds red",
             "no pixel",
-            "together",
         ):
             assert word in told.out
 
