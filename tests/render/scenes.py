@@ -40,6 +40,12 @@ def make_scene(bank: Bank, batch=2, height=9, width=12) -> tuple[Tensor, Tensor]
     return image, lowest + (highest - lowest) * torch.rand(batch, 1, height, width, **like)
 
 
+def squares(bank: Bank, height: int, width: int, side: int = 11) -> Tensor:
+    """Return a defocus map of squares, (1, 1, H, W): tiles of one layer and of several."""
+    y, x = torch.arange(height)[:, None] // side, torch.arange(width) // side
+    return bank.defocus[((y * 3 + x * 5) % len(bank.defocus)).to(bank.defocus.device)][None, None]
+
+
 def modelled(image: Tensor, defocus: Tensor, bank: Bank, compositing: str, border: str) -> Tensor:
     """Return what tests/oracle makes of the first scene of a batch with nearest layers."""
     weights = oracle.layer_weights(defocus[0, 0].numpy(), bank.defocus.tolist(), "nearest")

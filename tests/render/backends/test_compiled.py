@@ -158,21 +158,6 @@ class TestCompiledRender(RenderTester):
         self.assert_close(1e39 * dim.double(), render(image, defocus, bank, **options), rtol=0, atol=1e-4)
         assert torch.tensor(1e-39) * 0.5 > 0
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-    @pytest.mark.parametrize("size", [5, 7])
-    @pytest.mark.parametrize("border", BORDERS)
-    def test_gradcheck(self, compositing, size, border, device):
-        bank = make_bank(3, 2, size, device=device, light=0.8, veil=True)
-        image, _ = make_scene(bank, 2, 11, 25)
-        middles = torch.tensor([-25.0, -17.0, -8.0, 3.0], device=device, dtype=torch.float64)  # away from the nodes
-        defocus = middles[torch.randint(4, (2, 1, 11, 25), device=device)]
-
-        def function(image, defocus, psfs, veil):
-            scene = Bank(psfs, bank.defocus, veil)
-            return render(image, defocus, scene, compositing, border=border, method="compiled")
-
-        self.gradcheck(function, (image, defocus, bank.psfs, bank.veil))
-
     def test_feature_gradients_on_nodes_are_those_of_the_interval_above(self, device):
         bank = make_bank(4, 1, 5, device=device)
         image, _ = make_scene(bank, 1, 12, 20)
@@ -199,15 +184,6 @@ class TestOcclusion(RenderTester):
                 expected = render(image, defocus.double(), bank, "occlusion", layers=layers, method="dense")
                 coded = render(image.float(), defocus, single, "occlusion", layers=layers, method="compiled")
                 self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
-
-    def test_feature_absent_layers_are_not_looked_at(self, device, dtype):
-        bank = make_bank(6, 1, 7, dtype=dtype, device=device)
-        image, _ = make_scene(bank, 1, 20, 70)
-        defocus = torch.full((1, 1, 20, 70), -7.0, device=device, dtype=dtype)  # between nodes 1 and 2
-        defocus[..., 40:] = bank.defocus[1]
-        expected = render(image, defocus, bank, "occlusion", method="compiled")
-        bank.psfs[[0, 3, 4, 5]] = float("nan")
-        assert torch.equal(render(image, defocus, bank, "occlusion", method="compiled"), expected)
 
     def test_feature_psfs_a_little_below_zero_change_nothing(self, device):
         """As interpolation and round-off leave them."""
