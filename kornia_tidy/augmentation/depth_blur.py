@@ -25,7 +25,10 @@ from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.render.compositing import render
 
-SPACING = 0.5  # pixels of radius between two discs; between them the discs are blended
+_SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
+# Discs are computed where log(radius + _OFFSET) is evenly spaced, about so many for each factor of e. The larger two
+# discs are, the farther apart they may be for the same error of their blend.
+_OFFSET, _DENSITY = 1.0, 6.0
 COLOR_SPACES = ("srgb", "linear")
 
 
@@ -95,9 +98,9 @@ def depth_blur(
     Convention:
         - Geometrical optics: no diffraction. A radius below half a pixel is sharp. For phase masks and diffraction see
           :class:`~kornia_tidy.TiDyOptics`.
-        - Discs are computed every half pixel of radius, with the exact area in each pixel, and blended between: the
-          blend differs from the disc in between by at most 0.28 of its light (L1) between 0.5 and 1 px, by 0.12 up to
-          2 px and by 0.07 above.
+        - Discs are computed at 16 radii up to 16 px (see :func:`disc_layer`), with the exact area in each pixel, and
+          blended between: the blend differs from the disc in between by at most 0.15 of its light (L1). In a scene of
+          leaves that is 7e-4 of full scale (rms), less than 8 bits round.
         - The border is replicated.
 
     Source: Potmesil and Chakravarty: A lens and aperture camera model for synthetic image generation, SIGGRAPH 1981,
@@ -132,41 +135,86 @@ def depth_blur(
     )
     radius = blur_radius(depth.to(dtype), focus, aperture, focal_length, pixel_pitch)
     radius = radius.clamp(-max_radius, max_radius)
+    if compositing != "occlusion":
+        radius = radius.abs()  # near and far discs are alike: only occlusion needs their order
+    layer = disc_layer(radius, max_radius)
     light = image.to(dtype)
     if color_space == "srgb":
         light = srgb_to_linear(light)
-    blurred = render(light, radius, _discs(radius, image.shape[1]), compositing, border="replicate")
+    discs = _discs(layer, image.shape[1], max_radius)
+    blurred = render(light, layer, discs, compositing, border="replicate")
     if color_space == "srgb":
         blurred = linear_to_srgb(blurred)
     return blurred.to(image.dtype)
 
 
-def _discs(radius: Tensor, channels: int) -> SimpleNamespace:
-    """Return the discs around the radii of a scene, as the renderer reads PSFs."""
-    first, last = (float(end) / SPACING for end in torch.aminmax(radius.detach()))
-    steps = range(math.floor(first), math.ceil(last) + 1)
-    side = 2 * math.ceil(max(abs(steps[0]), abs(steps[-1])) * SPACING) + 1
-    psfs = torch.stack([disc(abs(step), side) for step in steps]).to(radius)
-    nodes = radius.new_tensor([step * SPACING for step in steps])
+def disc_layer(radius: Tensor, max_radius: float) -> Tensor:
+    r"""Return where radii lie between the computed discs: the number of a disc, and fractions between two.
+
+    .. math:: k(r) = n \, \mathrm{sign}(r) \, \log \frac{\max(|r|, r_0) + b}{r_0 + b} \Big/ \log \frac{R + b}{r_0 + b}
+
+    with points up to :math:`r_0` = 0.5 px, b = 1 px, the largest radius R and n discs larger than a point.
+
+    Args:
+        radius: r in pixels, any shape, at most R in magnitude.
+        max_radius: R in pixels.
+
+    Returns:
+        k, of the radius' shape: 0 is a point, n the largest disc. Negative for negative radii.
+
+    Example:
+        >>> disc_layer(torch.tensor([0.0, 1.0, 16.0]), 16.0).round(decimals=1)
+        tensor([ 0.0000,  1.8000, 15.0000])
+    """
+    scale = _discs_each_e(max_radius)
+    return ((radius.abs().clamp(min=_SHARP) + _OFFSET) / (_SHARP + _OFFSET)).log() * (radius.sign() * scale)
+
+
+def disc_radius(layer: int, max_radius: float) -> float:
+    """Return the radius of a computed disc in pixels, the inverse of :func:`disc_layer`; 0 for a point.
+
+    Example:
+        >>> round(disc_radius(15, 16.0), 6), round(disc_radius(-1, 16.0), 6)
+        (16.0, 0.763526)
+    """
+    if layer == 0:
+        return 0.0
+    return (_SHARP + _OFFSET) * math.exp(abs(layer) / _discs_each_e(max_radius)) - _OFFSET
+
+
+def _discs_each_e(max_radius: float) -> float:
+    """Return the number of discs for each factor of e: at least ``_DENSITY``, and the largest disc is one of them."""
+    logarithm = math.log((max(max_radius, _SHARP) + _OFFSET) / (_SHARP + _OFFSET))
+    return math.ceil(_DENSITY * logarithm) / logarithm if logarithm else 0.0
+
+
+def _discs(layer: Tensor, channels: int, max_radius: float) -> SimpleNamespace:
+    """Return the discs around the layers of a scene, as the renderer reads PSFs."""
+    first, last = (round(float(end), 4) for end in torch.aminmax(layer.detach()))  # the largest may be off by rounding
+    numbers = range(math.floor(first), math.ceil(last) + 1)
+    radii = [disc_radius(number, max_radius) for number in numbers]
+    side = 2 * math.ceil(round(max(radii), 4)) + 1
+    psfs = torch.stack([disc(radius, side) for radius in radii]).to(layer)
+    nodes = layer.new_tensor(list(numbers))
     return SimpleNamespace(psfs=psfs[:, None].expand(-1, channels, -1, -1), defocus=nodes, veil=None)
 
 
 @lru_cache(maxsize=1024)
-def disc(steps: int, side: int) -> Tensor:
+def disc(radius: float, side: int) -> Tensor:
     """Return a disc as a PSF: the share of its area in each pixel.
 
     Args:
-        steps: radius in steps of half a pixel; 0 is a point.
+        radius: pixels; 0 is a point.
         side: of the PSF in pixels, odd.
 
     Returns:
         (side, side) float64 that sums to one. It is remembered, and must not be changed.
 
     Example:
-        >>> disc(1, 3)[1, 1], disc(3, 3)[1]
+        >>> disc(0.5, 3)[1, 1], disc(1.5, 3)[1]
         (tensor(1., dtype=torch.float64), tensor([0.1375, 0.1415, 0.1375], dtype=torch.float64))
     """
-    area = circular_aperture(side, 1.0, max(steps, 0.1) * SPACING, edges="area")
+    area = circular_aperture(side, 1.0, max(radius, 0.1), edges="area")
     return area / area.sum()
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import convolve
 
 from kornia_tidy import NoMask, TiDyOptics
 from kornia_tidy.augmentation import DepthBlur, RandomDepthBlur, depth_blur
-from kornia_tidy.augmentation.depth_blur import blur_radius, disc
+from kornia_tidy.augmentation.depth_blur import blur_radius, disc, disc_radius
 from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import scene
@@ -47,15 +47,39 @@ class TestDepthBlur(BaseTester):
 
     @pytest.mark.parametrize("depth", [0.3, 0.9, 2.0, float("inf")])
     def test_feature_one_depth_is_a_convolution_with_its_disc(self, depth):
-        """Against scipy with a disc of counted points, at radii on the nodes: the f-number is chosen for them."""
+        """Against scipy with a disc of counted points, at the largest disc: the f-number is chosen for it."""
         image = torch.rand(1, 1, 24, 30, dtype=torch.float64)
         unit = float(blur_radius(torch.tensor(depth, dtype=torch.float64), 0.6, 1.0, **LENS))
         f_number = abs(unit) / 2.5
-        blurred = depth_blur(image, torch.full_like(image, depth), 0.6, f_number, color_space="linear", **LENS)
+        options = {"max_radius": 2.5, "color_space": "linear", **LENS}
+        blurred = depth_blur(image, torch.full_like(image, depth), 0.6, f_number, **options)
         expected = convolve(image[0, 0].numpy(), sampled_disc(2.5, 7), mode="nearest")
         # Points on a grid of 1/40 px: the rim, 2 pi r long, is off by less than half a spacing.
         bound = 2 * 2 * np.pi * 2.5 * 0.5 / 40 / (np.pi * 2.5**2)
         assert np.abs(blurred[0, 0].numpy() - expected).max() < bound
+
+    def test_feature_each_pixel_has_the_disc_of_its_depth(self):
+        """Against a mean by a disc of counted points for each pixel: a blend of two discs is off by 0.15 in L1."""
+        image, depth = torch.rand(1, 1, 20, 23, dtype=torch.float64), scene(1, height=20, width=23)[1].double()
+        blurred = depth_blur(image, depth, 0.6, 0.7, max_radius=5.0, color_space="linear", **LENS)[0, 0]
+        radius = blur_radius(depth, 0.6, 0.7, **LENS)[0, 0].abs().clamp(max=5.0)
+        assert radius.min() < 1
+        assert radius.max() > 4
+        around = np.pad(image[0, 0].numpy(), 5, mode="edge")
+        for y in range(20):
+            for x in range(23):
+                expected = (around[y : y + 11, x : x + 11] * sampled_disc(max(float(radius[y, x]), 0.1), 11)).sum()
+                assert abs(float(blurred[y, x]) - expected) < 0.5 * 0.15 + 0.005
+
+    def test_feature_blends_of_discs_are_within_their_bound(self):
+        for number in range(15):
+            first, middle, last = (disc_radius(number + part, 16.0) for part in (0, 0.5, 1))
+            blend = (disc(first, 33) + disc(last, 33)) / 2
+            assert np.abs(blend.numpy() - sampled_disc(middle, 33)).sum() < 0.16
+
+    def test_feature_a_limit_below_half_a_pixel_is_sharp(self):
+        image, depth = scene(1)
+        self.assert_close(depth_blur(image, depth, 0.6, 2.0, max_radius=0.4, **LENS), image, atol=1e-5)
 
     def test_feature_radius_of_a_thin_lens(self):
         """50 mm at f/2, focused at 1 m: s' = 52.63 mm, so that infinity has a disc of 25 mm * 52.63 mm / 1 m."""
@@ -116,8 +140,8 @@ class TestDepthBlur(BaseTester):
         )
 
     def test_smoke_discs_sum_to_one(self):
-        for steps in (0, 1, 2, 7, 32):
-            assert abs(float(disc(steps, 33).sum()) - 1) < 1e-12
+        for radius in (0, 0.5, 1.0, 3.3, 16.0):
+            assert abs(float(disc(radius, 33).sum()) - 1) < 1e-12
 
 
 class TestRandomDepthBlur(BaseTester):
