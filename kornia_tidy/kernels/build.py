@@ -312,7 +312,7 @@ def _content_digest(path: Path) -> str:
 
 def _digest(source: Path, compiler: Compiler, flags: tuple[str, ...]) -> str:
     """Name all that a library depends on in 16 digits. One source may include others of its folder."""
-    sources = [SHARED, *sorted(source.parent.glob("*.c"))]
+    sources = [*sorted(source.parent.glob("*.h")), *sorted(source.parent.glob("*.c"))]
     words = [source.name, *compiler.program, compiler.version, *flags, *compiler.options]
     parts = [*(path.read_bytes() for path in sources), *(word.encode() for word in words), processor_features()]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]

@@ -14,6 +14,7 @@
 #include <stdlib.h>
 
 #include "vectors.h"
+#include "field.h"
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
 enum { ROW_CHUNK = 4 };  // rows of light that are summed separately

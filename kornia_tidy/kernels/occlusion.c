@@ -14,6 +14,9 @@
 //   each end. They come from tables in double, since a difference keeps only absolute accuracy.
 // - Weights between 0 and 1, of pixels shared by two layers, are convolved like light.
 //
+// With PSFs over the field a block lies in a tile of them, and is blurred by the value and the slopes of its PSF. Layers
+// are then normalised by the part of the PSF's light that sees them, so that a relative illumination stays.
+//
 // Compiled by build.py with REAL as float or double.
 
 #include "direct.c"
@@ -40,6 +43,7 @@ typedef struct {
     REAL *out;          // (images, channels, height, width)
     const REAL *gradient;  // of `out`
     REAL *psf_gradient, *veil_gradient;  // of `psfs` and `veil`, like them
+    field over;         // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
 } scene_parameters;
 
 // A run of pixels of one row with the same layer index; either all or none of them are shared with the next layer.
@@ -53,7 +57,7 @@ typedef struct {
     int32_t from, to;
 } ray;
 
-enum { BLURRED, ALPHA, DIVISOR, PASSED, KEPT, CUMULATIVE = DIVISOR };  // the first three, then their gradients
+enum { BLURRED, ALPHA, DIVISOR, PASSED, LIT, KEPT, CUMULATIVE = DIVISOR };  // the first three, then their gradients
 
 // Start (sign 1) or end (-1) of a run of weights 1, as an index into the tables of partial sums.
 typedef struct {
@@ -87,7 +91,10 @@ typedef struct {
     vec (*total)[BAND], (*through)[BAND];  // by channel: light of the nearer layers, and their transmission
     outline outline;
     vec (*kept)[KEPT][BAND];  // of a block, by layer and channel, for gradients
-    void *all[20];
+    lines psfs;         // of a row of tiles, by layer and channel
+    vec *psf;           // of a tile, (ORDERS, vectors), and
+    double *tables;     // their tables
+    void *all[22];
     int count;
 } workspace;
 
@@ -344,8 +351,41 @@ static int64_t window_pitch(const scene_parameters *s) { return (s->side + 2 * L
 
 // ---- Blocks.
 
+// Rows or columns of pixels that are rendered together, within a block that begins at `at`: the last one of an image or
+// a tile overlaps with others.
+typedef struct {
+    int64_t at, from, to, tile;
+} span;
+
+INLINE span span_at(int64_t from, int64_t end, int64_t size, int64_t pixels, int64_t tile) {
+    return (span){least(from, pixels - size), from, least(from + size, end), tile};
+}
+
+// A block of one strip, at the corner of its window.
+typedef struct {
+    int64_t image;
+    span rows, columns;
+    int64_t light;  // of the first channel's pixel in `plane`
+    const REAL *lower, *share;
+    int layers;
+} block;
+
+static block block_at(const scene_parameters *s, workspace *d, int64_t image, span rows, span columns) {
+    const int64_t corner = image * s->map_image + rows.at * s->map_row + columns.at;
+    const int64_t light = image * s->plane_image + rows.at * s->plane_row + columns.at;
+    int count = list_layers(s, d, s->side + BAND - 1, columns.at, s->side + LANES - 1);
+    return (block){image, rows, columns, light, s->lower + corner, s->share ? s->share + corner : 0, count};
+}
+
+// What a term of a tile's PSF is multiplied by in a row of the block: 1, x or y.
+INLINE vec factor(const scene_parameters *s, const block *b, int order, int v) {
+    if (order == ALONG_X) return steps() + ((REAL)b->columns.at - s->over.column_middles[b->columns.tile]);
+    return all(order == ALONG_Y ? (REAL)(b->rows.at + v) - s->over.row_middles[b->rows.tile] : 1);
+}
+
 // Renders a block of two strips with a single layer in its window: ((1 - veil) L + veil mean A) / A.
-static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
+static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, span lines, int64_t x) {
+    const int64_t y = lines.at;
     int32_t layer = d->heads[0]->layer;
     int64_t area = s->side * s->side, rows = s->side + BAND - 1;
     for (int64_t c = 0; c < s->channels; c++) {
@@ -366,29 +406,16 @@ static void lay_alone(const scene_parameters *s, workspace *d, const double *tab
         REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
         REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
         REAL divisor = (whole > 0 ? whole : 0) + EPSILON;
-        for (int v = skip; v < BAND; v++)
+        for (int v = lines.from - y; v < BAND; v++)
             for (int strip = 0; strip < 2; strip++)
                 *(loose *)(out + v * s->width + strip * LANES) = ((1 - veil) * light[strip][v] + glow) / divisor;
     }
 }
 
-// A block of one strip, at the corner of its window.
-typedef struct {
-    int64_t image, x, light;  // light: of the first channel's pixel in `plane`
-    const REAL *lower, *share;
-    int layers;
-} block;
-
-static block block_at(const scene_parameters *s, workspace *d, int64_t image, int64_t y, int64_t x) {
-    int64_t corner = image * s->map_image + y * s->map_row + x;
-    int count = list_layers(s, d, s->side + BAND - 1, x, s->side + LANES - 1);
-    return (block){image, x, image * s->plane_image + y * s->plane_row + x, s->lower + corner, s->share ? s->share + corner : 0, count};
-}
-
 // Finds a layer in a window, and the rows of its shared weights.
 static void find_layer(const scene_parameters *s, workspace *d, const block *b, int32_t layer, int copied) {
     outline *o = &d->outline;
-    draw_outline(s, d, b->x, layer, window_pitch(s), copied);
+    draw_outline(s, d, b->columns.at, layer, window_pitch(s), copied);
     if (o->lower_count) mask_rows(s, o->lower, layer, LOWER, b->lower, b->share, b->lower, d->rows[1], window_pitch(s));
     if (o->upper_count) mask_rows(s, o->upper, layer, UPPER, b->lower, b->share, b->lower, d->rows[2], window_pitch(s));
 }
@@ -403,15 +430,11 @@ static void find_light(const scene_parameters *s, workspace *d, const block *b, 
     mask_light(s, d->outline.light, layer, b->lower, b->share, plane, d->rows[0], window_pitch(s));
 }
 
-// Blurs light, alpha and cumulative alpha of the n-th layer from near, which was found, in one channel.
-INLINE void blur_layer(const scene_parameters *s, workspace *d, const double *tables, const block *b, int n, int64_t c,
-                       vec (*light)[BAND], vec (*own)[BAND], vec (*seen)[BAND]) {
+// Blurs light, alpha and cumulative alpha of the n-th layer from near by a PSF. The layer and its light were found.
+INLINE void blur(const scene_parameters *s, workspace *d, const REAL *psf, const double *table, const block *b, int n,
+                 vec (*light)[BAND], vec (*own)[BAND], vec (*seen)[BAND]) {
     const outline *o = &d->outline;
-    const int64_t plane = d->members[n] * s->channels + c;
-    const REAL *psf = s->psfs + plane * s->side * s->side;
-    const double *table = tables + plane * table_size(s);
     vec weight[1][BAND];
-    find_light(s, d, b, d->members[n], c);
     convolve_one(d->rays, psf, s->side, light);
     add_edges(s, table, &o->own, *own);
     if (n == b->layers - 1) memcpy(seen, own, sizeof *seen);  // the farthest layer: the cumulative alpha is its own
@@ -426,9 +449,42 @@ INLINE void blur_layer(const scene_parameters *s, workspace *d, const double *ta
     }
 }
 
+// Blurs planes as above in one channel, by the PSF of each pixel, whose light goes to `lit`.
+static void blur_over_field(const scene_parameters *s, workspace *d, const block *b, int n, int64_t c, vec (*light)[BAND],
+                            vec (*own)[BAND], vec (*seen)[BAND], vec *lit) {
+    const int64_t plane = d->members[n] * s->channels + c, area = s->side * s->side, vectors = d->psfs.vectors;
+    blend_nodes(&d->psfs, plane, s->psfs + plane * area, s->layers * s->channels * area, 1);
+    blend_line(&d->psfs, plane, b->columns.tile, d->psf);
+    for (int order = 0; order < ORDERS; order++) {
+        if (!has_order(&s->over, b->rows.tile, b->columns.tile, order)) continue;
+        double *table = d->tables + order * table_size(s);
+        vec more[3][1][BAND], sum = {0};
+        fill_table(s, (REAL *)(d->psf + order * vectors), table);
+        for (int64_t k = 0; k < vectors; k++) sum += d->psf[order * vectors + k];
+        blur(s, d, (REAL *)(d->psf + order * vectors), table, b, n, more[0], more[1], more[2]);
+        const REAL whole = sum_of(sum);
+        for (int v = 0; v < BAND; v++) {
+            const vec times = factor(s, b, order, v);
+            light[0][v] = times * more[0][0][v] + (order ? light[0][v] : all(0));
+            own[0][v] = times * more[1][0][v] + (order ? own[0][v] : all(0));
+            seen[0][v] = times * more[2][0][v] + (order ? seen[0][v] : all(0));
+            lit[v] = times * whole + (order ? lit[v] : all(0));
+        }
+    }
+}
+
+// Blurs the n-th layer from near, which was found, in one channel. `lit` is only written with PSFs over the field.
+INLINE void blur_layer(const scene_parameters *s, workspace *d, const double *tables, const block *b, int n, int64_t c,
+                       vec (*light)[BAND], vec (*own)[BAND], vec (*seen)[BAND], vec *lit) {
+    const int64_t plane = d->members[n] * s->channels + c;
+    find_light(s, d, b, d->members[n], c);
+    if (s->over.node_rows) blur_over_field(s, d, b, n, c, light, own, seen, lit);
+    else blur(s, d, s->psfs + plane * s->side * s->side, tables + plane * table_size(s), b, n, light, own, seen);
+}
+
 // Renders a block of one strip by compositing its layers from near to far.
-static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, int64_t y, int64_t x, int skip) {
-    const block b = block_at(s, d, image, y, x);
+static void lay_over(const scene_parameters *s, workspace *d, const double *tables, int64_t image, span rows, span columns) {
+    const block b = block_at(s, d, image, rows, columns);
     vec(*total)[BAND] = d->total, (*through)[BAND] = d->through;
     for (int64_t c = 0; c < s->channels; c++)
         for (int v = 0; v < BAND; v++) total[c][v] = (vec){0}, through[c][v] = 1 - (vec){0};
@@ -436,21 +492,26 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
         int32_t layer = d->members[n];
         find_layer(s, d, &b, layer, 0);
         for (int64_t c = 0; c < s->channels; c++) {
-            vec light[1][BAND], own[1][BAND], seen[1][BAND];
-            blur_layer(s, d, tables, &b, n, c, light, own, seen);
+            vec light[1][BAND], own[1][BAND], seen[1][BAND], lit[BAND];
+            blur_layer(s, d, tables, &b, n, c, light, own, seen, lit);
             REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
             REAL glow = s->veil ? veil * s->mean[image * s->channels + c] : 0;
             for (int v = 0; v < BAND; v++) {
                 vec passed = through[c][v] / (only(seen[0][v], seen[0][v] > 0) + EPSILON);
+                if (s->over.node_rows) light[0][v] *= lit[v];
                 total[c][v] += passed * ((1 - veil) * light[0][v] + glow * own[0][v]);
                 through[c][v] -= passed * own[0][v];
             }
         }
     }
-    for (int64_t c = 0; c < s->channels; c++) {
-        REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-        for (int v = skip; v < BAND; v++) *(loose *)(out + v * s->width) = total[c][v];
-    }
+    const int64_t first = columns.from - columns.at, count = columns.to - columns.from;
+    for (int64_t c = 0; c < s->channels; c++)
+        for (int64_t y = rows.from; y < rows.to; y++) {
+            REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + columns.from;
+            const REAL *from = (const REAL *)&total[c][y - rows.at] + first;
+            if (count == LANES) memcpy(out, from, sizeof(vec));
+            else memcpy(out, from, count * sizeof(REAL));
+        }
 }
 
 // Counts of operations for the cost of a scene, see `count_operations` in occlusion_ops.py.
@@ -509,7 +570,9 @@ static int allocate_workspace(const scene_parameters *s, workspace *d) {
     o->own.rows = take(d, rows * sizeof(edge));
     o->behind.rows = take(d, rows * sizeof(edge));
     d->kept = take(d, (s->gradient ? (s->layers + 1) * s->channels : 1) * sizeof *d->kept);
-    int ok = 1;
+    int ok = take_lines(&s->over, s->layers * s->channels, s->side * s->side, &d->psfs);
+    d->psf = take(d, ORDERS * d->psfs.vectors * sizeof(vec));
+    d->tables = take(d, (s->over.node_rows ? ORDERS : 0) * table_size(s) * sizeof(double));
     for (int n = 0; n < d->count; n++) ok &= d->all[n] != 0;
     for (int64_t r = 0; ok && r < rows; r++) d->made[r] = -1;
     return ok;
@@ -517,30 +580,56 @@ static int allocate_workspace(const scene_parameters *s, workspace *d) {
 
 static void free_workspace(workspace *d) {
     for (int n = 0; n < d->count; n++) free(d->all[n]);
+    free_lines(&d->psfs);
+}
+
+// How many tables all blocks share: none where they have PSFs of their own.
+static int64_t tables_of(const scene_parameters *s) { return s->over.node_rows ? 0 : s->layers * s->channels; }
+
+// Rows of tiles or, with the same PSFs everywhere, bands of blocks.
+static int64_t bands_of(const scene_parameters *s) { return s->over.node_rows ? s->over.down : (s->height + BAND - 1) / BAND; }
+
+// Finds the rows of a band, with the runs of their windows.
+static span begin_band(const scene_parameters *s, workspace *d, int64_t image, int64_t band) {
+    const int64_t *edges = s->over.row_edges;
+    const span rows = s->over.node_rows ? span_at(edges[band], edges[band + 1], BAND, s->height, band)
+                                        : span_at(band * BAND, s->height, BAND, s->height, band);
+    find_runs_of_band(s, d, image, rows.at);
+    if (s->over.node_rows) begin_row(&d->psfs, band);
+    return rows;
+}
+
+// The block after some columns of a band, in one tile.
+static span next_block(const scene_parameters *s, span columns) {
+    const int64_t *edges = s->over.column_edges;
+    int64_t tile = columns.tile, end = s->width;
+    if (s->over.node_rows) {
+        tile += columns.to == edges[tile + 1];
+        end = edges[tile + 1];
+    }
+    return span_at(columns.to, end, LANES, s->width, tile);
 }
 
 // Renders a band or, with `counts`, only counts its operations.
-static void lay_band(const scene_parameters *s, workspace *d, const double *tables, int64_t band, int64_t *counts) {
-    int64_t bands = (s->height + BAND - 1) / BAND, rows = s->side + BAND - 1, image = band / bands;
-    int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
-    int skip = top - y;  // rows of the previous band, which another thread may be writing
-    find_runs_of_band(s, d, image, y);
-    for (int64_t x = 0, next; x < s->width; x = next) {
-        int64_t left = least(x, s->width - LANES);
-        int wide = left + WIDTH <= s->width && move_heads(d, rows, left, s->side + WIDTH - 1);
-        next = x + (wide ? WIDTH : LANES);
-        if (!wide) move_heads(d, rows, left, 0);
+static void lay_band(const scene_parameters *s, workspace *d, const double *tables, int64_t n, int64_t *counts) {
+    const int64_t height = s->side + BAND - 1, image = n / bands_of(s);
+    const span rows = begin_band(s, d, image, n % bands_of(s));
+    for (span x = {0}; x.to < s->width;) {
+        x = next_block(s, x);
+        const int wide = !s->over.node_rows && x.at + WIDTH <= s->width && move_heads(d, height, x.at, s->side + WIDTH - 1);
+        if (!wide) move_heads(d, height, x.at, 0);
         if (counts && wide) counts[ALONE]++;
-        else if (counts) count_block(s, d, left, counts);
-        else if (wide) lay_alone(s, d, tables, image, y, left, skip);
-        else lay_over(s, d, tables, image, y, left, skip);
+        else if (counts) count_block(s, d, x.at, counts);
+        else if (wide) lay_alone(s, d, tables, image, rows, x.at);
+        else lay_over(s, d, tables, image, rows, x);
+        if (wide) x.to += LANES;
     }
 }
 
 // Counts the operations of every `every`-th band as of vectors of 64 bytes, which costs are known for. Only what a pair
 // takes, the outline of a layer and its masks, is as much for narrow vectors. Returns 0, or 1 if there is no memory.
 int count(const scene_parameters *s, int64_t every, int64_t *counts) {
-    int64_t bands = s->images * ((s->height + BAND - 1) / BAND);
+    int64_t bands = s->images * bands_of(s);
     workspace d;
     int ok = allocate_workspace(s, &d);
     for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
@@ -552,8 +641,8 @@ int count(const scene_parameters *s, int64_t every, int64_t *counts) {
 
 // Renders a scene by occlusion-aware compositing of its layers. Returns 0, or 1 if there is no memory.
 int occlude(const scene_parameters *s) {
-    int64_t bands = (s->height + BAND - 1) / BAND, all = s->layers * s->channels, failed = 0;
-    double *tables = malloc(all * table_size(s) * sizeof(double));
+    int64_t bands = bands_of(s), all = tables_of(s), failed = 0;
+    double *tables = malloc((all + 1) * table_size(s) * sizeof(double));
     if (!tables) return 1;
 #pragma omp parallel num_threads(s->threads)
     {
@@ -584,6 +673,8 @@ typedef struct {
     REAL *band;  // of PSFs, (LINES side / LINES, pitch) rounded up, of the blocks of one band
     char *met;   // whether a block of the band has the layer
     int64_t pitch, size;
+    lines lines;  // of a row of tiles, and
+    vec *nodes;   // of all of them, with PSFs over the field
 } tally;
 
 static int allocate_tally(const scene_parameters *s, tally *t) {
@@ -594,10 +685,17 @@ static int allocate_tally(const scene_parameters *s, tally *t) {
     t->psfs = t->tables + planes * table_size(s), t->veil = t->psfs + planes * area;
     t->band = calloc(planes * t->size, sizeof(REAL));
     t->met = calloc(s->layers, 1);
-    return t->tables && t->band && t->met;
+    const int taken = take_lines(&s->over, planes, area, &t->lines);
+    const int64_t vectors = s->over.node_rows * s->over.node_columns * planes * t->lines.vectors;
+    t->nodes = aligned_alloc(sizeof(vec), (vectors + 1) * sizeof(vec));
+    if (t->nodes) memset(t->nodes, 0, vectors * sizeof(vec));
+    return taken && t->tables && t->band && t->met && t->nodes;
 }
 
-static void free_tally(tally *t) { free(t->tables), free(t->band), free(t->met); }
+static void free_tally(tally *t) {
+    free(t->tables), free(t->band), free(t->met), free(t->nodes);
+    free_lines(&t->lines);
+}
 
 // Adds the products of a row of light, the r-th, with the block's rows that it meets for lines `first` to `last`.
 INLINE void add_row(const ray *row, REAL (*block)[LANES], int64_t r, int first, int last, int64_t j, int width, vec (*sums)[SPAN]) {
@@ -687,7 +785,7 @@ static void keep_layers(const scene_parameters *s, workspace *d, const double *t
         find_layer(s, d, b, d->members[n], 1);
         for (int64_t c = 0; c < s->channels; c++) {
             vec(*k)[BAND] = d->kept[n * s->channels + c];
-            blur_layer(s, d, tables, b, n, c, k + BLURRED, k + ALPHA, k + CUMULATIVE);
+            blur_layer(s, d, tables, b, n, c, k + BLURRED, k + ALPHA, k + CUMULATIVE, k[LIT]);
             for (int v = 0; v < BAND; v++) {
                 k[DIVISOR][v] = only(k[CUMULATIVE][v], k[CUMULATIVE][v] > 0) + EPSILON;
                 k[PASSED][v] = through[c][v] / k[DIVISOR][v];
@@ -697,15 +795,17 @@ static void keep_layers(const scene_parameters *s, workspace *d, const double *t
     }
 }
 
-// Makes of what was kept the gradients of the blurred planes, from far to near. Of the block's pixels those above `skip` and
-// left of `overlap` belong to others.
-static void turn_back(const scene_parameters *s, workspace *d, tally *t, const block *b, const REAL *corner, int skip, int64_t overlap) {
+// Makes of what was kept the gradients of the blurred planes, and of the PSF's light, from far to near.
+static void turn_back(const scene_parameters *s, workspace *d, tally *t, const block *b) {
+    const span rows = b->rows, columns = b->columns;
     vec(*through)[BAND] = d->through;  // its gradient
     for (int64_t c = 0; c < s->channels; c++) {
         vec gradient[BAND];
         for (int v = 0; v < BAND; v++) {
-            gradient[v] = *(const loose *)(corner + (c * s->height + v) * s->width);
-            for (int lane = 0; lane < (v < skip ? LANES : overlap); lane++) gradient[v][lane] = 0;
+            const int64_t y = rows.at + v, row = ((b->image * s->channels + c) * s->height + y) * s->width;
+            gradient[v] = (vec){0};  // of pixels that other blocks render
+            if (y >= rows.from && y < rows.to)
+                for (int64_t x = columns.from; x < columns.to; x++) gradient[v][x - columns.at] = s->gradient[row + x];
             through[c][v] = (vec){0};
         }
         for (int n = b->layers - 1; n >= 0; n--) {
@@ -713,10 +813,12 @@ static void turn_back(const scene_parameters *s, workspace *d, tally *t, const b
             const REAL veil = s->veil ? s->veil[plane] : 0, mean = s->veil ? s->mean[b->image * s->channels + c] : 0;
             vec(*k)[BAND] = d->kept[n * s->channels + c], of_veil = {0};
             for (int v = 0; v < BAND; v++) {
-                vec light = k[BLURRED][v], own = k[ALPHA][v], divisor = k[DIVISOR][v], passed = k[PASSED][v];
+                const vec lit = s->over.node_rows ? k[LIT][v] : all(1), blurred = k[BLURRED][v], light = lit * blurred;
+                vec own = k[ALPHA][v], divisor = k[DIVISOR][v], passed = k[PASSED][v];
                 vec of_passed = gradient[v] * ((1 - veil) * light + veil * mean * own) - through[c][v] * own;
                 of_veil += gradient[v] * passed * (mean * own - light);
-                k[BLURRED][v] = (1 - veil) * gradient[v] * passed;
+                k[BLURRED][v] = (1 - veil) * gradient[v] * passed * lit;
+                k[LIT][v] = (1 - veil) * gradient[v] * passed * blurred;
                 k[ALPHA][v] = passed * (veil * mean * gradient[v] - through[c][v]);
                 k[CUMULATIVE][v] = only(-of_passed * passed / divisor, divisor > EPSILON);
                 through[c][v] += of_passed / divisor;
@@ -726,43 +828,73 @@ static void turn_back(const scene_parameters *s, workspace *d, tally *t, const b
     }
 }
 
+// Adds the gradient of a PSF that has blurred the n-th layer, from those of its planes times 1, x or y.
+static void add_layer(const scene_parameters *s, workspace *d, const tally *t, const block *b, int n, int64_t c, int order,
+                      REAL *total, double *table) {
+    const outline *o = &d->outline;
+    vec planes[CUMULATIVE + 1][BAND], both[BAND];
+    for (int k = 0; k <= CUMULATIVE; k++)
+        for (int v = 0; v < BAND; v++) planes[k][v] = factor(s, b, order, v) * d->kept[n * s->channels + c][k][v];
+    for (int v = 0; v < BAND; v++) both[v] = planes[ALPHA][v] + planes[CUMULATIVE][v];
+    correlate_rays(d->rays, planes[BLURRED], s->side, t, total);
+    if (n < b->layers - 1) spread_edges(s, table, &o->behind, planes[CUMULATIVE]);
+    spread_edges(s, table, &o->own, n < b->layers - 1 ? planes[ALPHA] : both);
+    if (o->lower_count) correlate_rays(o->lower, both, s->side, t, total);
+    if (o->upper_count) correlate_rays(o->upper, planes[ALPHA], s->side, t, total);
+}
+
+// Adds the gradient of a layer's PSF in a tile to those of its row of tiles.
+static void add_over_field(const scene_parameters *s, workspace *d, tally *t, const block *b, int n, int64_t c) {
+    const int64_t plane = d->members[n] * s->channels + c, vectors = t->lines.vectors, area = s->side * s->side;
+    memset(d->psf, 0, ORDERS * vectors * sizeof(vec));
+    for (int order = 0; order < ORDERS; order++) {
+        if (!has_order(&s->over, b->rows.tile, b->columns.tile, order)) continue;
+        REAL *psf = (REAL *)(d->psf + order * vectors);
+        vec of_light = {0};
+        memset(t->band, 0, t->size * sizeof(REAL)), memset(t->tables, 0, table_size(s) * sizeof(double));
+        memset(t->psfs, 0, area * sizeof(double));
+        add_layer(s, d, t, b, n, c, order, t->band, t->tables);
+        fold_table(s, t->tables, t->psfs);
+        for (int v = 0; v < BAND; v++) of_light += factor(s, b, order, v) * d->kept[n * s->channels + c][LIT][v];
+        const REAL whole = sum_of(of_light);
+        for (int64_t j = 0; j < s->side; j++)
+            for (int64_t i = 0; i < s->side; i++)
+                psf[j * s->side + i] = whole + t->band[i * t->pitch + j] + (REAL)t->psfs[j * s->side + i];
+    }
+    spread_tile(&t->lines, plane, b->columns.tile, d->psf);
+}
+
 // Adds the gradients of the PSFs from those of the planes that they have blurred.
 static void add_layers(const scene_parameters *s, workspace *d, tally *t, const block *b) {
-    const outline *o = &d->outline;
     for (int n = 0; n < b->layers; n++) {
         const int32_t layer = d->members[n];
         find_layer(s, d, b, layer, 1);
         t->met[layer] = 1;
         for (int64_t c = 0; c < s->channels; c++) {
             const int64_t plane = layer * s->channels + c;
-            vec(*k)[BAND] = d->kept[n * s->channels + c], both[BAND];
-            double *table = t->tables + plane * table_size(s);
-            REAL *total = t->band + plane * t->size;
-            for (int v = 0; v < BAND; v++) both[v] = k[ALPHA][v] + k[CUMULATIVE][v];
             find_light(s, d, b, layer, c);
-            correlate_rays(d->rays, k[BLURRED], s->side, t, total);
-            if (n < b->layers - 1) spread_edges(s, table, &o->behind, k[CUMULATIVE]);
-            spread_edges(s, table, &o->own, n < b->layers - 1 ? k[ALPHA] : both);
-            if (o->lower_count) correlate_rays(o->lower, both, s->side, t, total);
-            if (o->upper_count) correlate_rays(o->upper, k[ALPHA], s->side, t, total);
+            if (s->over.node_rows) add_over_field(s, d, t, b, n, c);
+            else add_layer(s, d, t, b, n, c, VALUE, t->band + plane * t->size, t->tables + plane * table_size(s));
         }
     }
 }
 
-static void go_back(const scene_parameters *s, workspace *d, tally *t, const double *tables, int64_t band) {
-    const int64_t bands = (s->height + BAND - 1) / BAND, image = band / bands, area = s->side * s->side;
-    const int64_t top = band % bands * BAND, y = least(top, s->height - BAND);
-    find_runs_of_band(s, d, image, y);
-    for (int64_t x = 0; x < s->width; x += LANES) {
-        const int64_t left = least(x, s->width - LANES);
-        move_heads(d, s->side + BAND - 1, left, 0);
-        const block b = block_at(s, d, image, y, left);
+static void go_back(const scene_parameters *s, workspace *d, tally *t, const double *tables, int64_t n) {
+    const int64_t image = n / bands_of(s), area = s->side * s->side, planes = s->layers * s->channels;
+    const span rows = begin_band(s, d, image, n % bands_of(s));
+    t->lines.row = -1;
+    if (s->over.node_rows) begin_row(&t->lines, rows.tile);
+    for (span x = {0}; x.to < s->width;) {
+        x = next_block(s, x);
+        move_heads(d, s->side + BAND - 1, x.at, 0);
+        const block b = block_at(s, d, image, rows, x);
         keep_layers(s, d, tables, &b);
-        turn_back(s, d, t, &b, s->gradient + (image * s->channels * s->height + y) * s->width + left, top - y, x - left);
+        turn_back(s, d, t, &b);
         add_layers(s, d, t, &b);
     }
-    for (int64_t n = 0; n < s->layers * s->channels; n++) {
-        if (!t->met[n / s->channels]) continue;
+    for (int64_t n = 0; n < planes; n++) {
+        if (s->over.node_rows) spread_line(&t->lines, n, t->nodes + n * t->lines.vectors, planes * t->lines.vectors);
+        if (s->over.node_rows || !t->met[n / s->channels]) continue;
         REAL *total = t->band + n * t->size;
         for (int64_t i = 0; i < s->side; i++)
             for (int64_t j = 0; j < s->side; j++) t->psfs[n * area + j * s->side + i] += total[i * t->pitch + j];
@@ -774,13 +906,13 @@ static void go_back(const scene_parameters *s, workspace *d, tally *t, const dou
 // Computes the gradients of PSFs and stray light from that of the light. Each thread sums bands, always the same ones, and
 // threads are summed in their order. Returns 0, or 1 if there is no memory.
 int occlusion_gradients(const scene_parameters *s) {
-    const int64_t bands = s->images * ((s->height + BAND - 1) / BAND), all = s->layers * s->channels, area = s->side * s->side;
-    double *tables = malloc(all * table_size(s) * sizeof(double));
+    const int64_t bands = s->images * bands_of(s), all = s->layers * s->channels, area = s->side * s->side;
+    double *tables = malloc((tables_of(s) + 1) * table_size(s) * sizeof(double));
     tally *tallies = calloc(s->threads, sizeof *tallies);
     int failed = !tables || !tallies;
     if (!failed) {
 #pragma omp parallel for schedule(static, 1) num_threads(s->threads)
-        for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * area, tables + n * table_size(s));
+        for (int64_t n = 0; n < tables_of(s); n++) fill_table(s, s->psfs + n * area, tables + n * table_size(s));
 #pragma omp parallel for schedule(static, 1) num_threads(s->threads)
         for (int64_t thread = 0; thread < s->threads; thread++) {
             workspace d;
@@ -792,11 +924,17 @@ int occlusion_gradients(const scene_parameters *s) {
             }
             for (int64_t n = bands * thread / s->threads; ready && n < bands * (thread + 1) / s->threads; n++)
                 go_back(s, &d, t, tables, n);
-            for (int64_t n = 0; ready && n < all; n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
+            for (int64_t n = 0; ready && n < tables_of(s); n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
             free_workspace(&d);
         }
     }
-    for (int64_t n = 0; !failed && n < all * (area + 1); n++) {
+    for (int64_t n = 0; !failed && n < s->over.node_rows * s->over.node_columns * all * area; n++) {
+        const int64_t at = n / area * tallies->lines.vectors * LANES + n % area;
+        double sum = 0;
+        for (int64_t thread = 0; thread < s->threads; thread++) sum += ((REAL *)tallies[thread].nodes)[at];
+        s->psf_gradient[n] = sum;
+    }
+    for (int64_t n = 0; !failed && !s->over.node_rows && n < all * (area + 1); n++) {
         double sum = 0;
         for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].psfs[n];  // `veil` follows `psfs`
         if (n < all * area) s->psf_gradient[n] = sum;

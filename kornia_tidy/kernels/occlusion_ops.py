@@ -7,6 +7,7 @@ A second operator makes the gradients of PSFs and stray light. Those of light an
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,11 +16,13 @@ from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import KERNELS, load, vector_bytes
 from kornia_tidy.kernels.operators import Parameters, define
+from kornia_tidy.kernels.places import PLACES, of_axis, parameters_of
 from kornia_tidy.kernels.scene_checks import check_dtypes, check_light, check_psfs, check_shape, check_smallest
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "occlusion.c"
 BLOCK_ROWS = 8  # of a block of pixels, see occlusion.c
+TILE = (8, 16)  # largest rows and columns of a tile with a PSF over the field: a block of the widest vectors
 EPSILON = 1e-6  # added to the divisor, see occlusion.c
 SMALLEST_SIDE = BLOCK_ROWS - 1  # px, of PSFs; smaller ones are padded to it
 # Operations for each pixel of a block, as many as take as long: to begin and end the sums of a layer, for a column of a
@@ -35,18 +38,22 @@ def occlusion_direct(
     mean: Tensor | None = None,
     stray_light: Tensor | None = None,
     inside: Tensor | None = None,
+    places: Sequence[Tensor] = (),
 ) -> Tensor:
     """Render layers that hide one another by direct convolution: operator ``kornia_tidy::occlusion_direct``.
 
     Args:
         plane: (B, C, H + P - 1, W + P - 1) image on a processor, with all that lies beyond its border; float32
             or float64.
-        psfs: (D, C, P, P) with P odd, of the plane's dtype, not negative anywhere. Layer D - 1 is the nearest.
+        psfs: (D, C, P, P) with P odd, of the plane's dtype, not negative anywhere. Layer D - 1 is the nearest. With
+            ``places`` (I, J, D, C, P, P): they are normalised but for their light, which an even scene then takes on.
         layer_index: (B or 1, H + P - 1, W + P - 1) layer of each pixel, whole numbers of any dtype.
         layer_weight: share of the next layer in [0, 1], of the same shape and the plane's dtype, or None for zero.
         mean: (B, C) mean light of each image, and
         stray_light: (D, C) share of it that each layer takes on; both or none.
         inside: (1, H + P - 1, W + P - 1) 1 on the image and 0 in the dark beyond it, or None for no dark.
+        places: :class:`~kornia_tidy.kernels.places.Places` of PSFs that vary over the field, with tiles of at most
+            :data:`TILE`. Default: PSFs are the same everywhere.
 
     Returns:
         (B, C, H, W). It has no gradient.
@@ -58,7 +65,8 @@ def occlusion_direct(
         MemoryError: if memory for the tables is missing.
         NotBuiltError: if the source cannot be compiled.
     """
-    return torch.ops.kornia_tidy.occlusion_direct(plane, psfs, layer_index, layer_weight, mean, stray_light, inside)
+    scene = plane, psfs, layer_index, layer_weight, mean, stray_light, inside
+    return torch.ops.kornia_tidy.occlusion_direct(*scene, list(places))
 
 
 def occlusion_direct_gradients(
@@ -70,6 +78,7 @@ def occlusion_direct_gradients(
     stray_light: Tensor | None,
     inside: Tensor | None,
     gradient: Tensor,
+    places: Sequence[Tensor] = (),
 ) -> list[Tensor]:
     """Return gradients of :func:`occlusion_direct`: operator ``kornia_tidy::occlusion_direct_gradients``.
 
@@ -84,6 +93,7 @@ def occlusion_direct_gradients(
         stray_light: as there.
         inside: as there.
         gradient: (B, C, H, W) of the light, of the plane's dtype.
+        places: as there.
 
     Returns:
         The gradient of the PSFs and, where there is stray light, that of ``stray_light``. They have none.
@@ -94,9 +104,8 @@ def occlusion_direct_gradients(
         MemoryError: as there.
         NotBuiltError: as there.
     """
-    return torch.ops.kornia_tidy.occlusion_direct_gradients(
-        plane, psfs, layer_index, layer_weight, mean, stray_light, inside, gradient
-    )
+    scene = plane, psfs, layer_index, layer_weight, mean, stray_light, inside
+    return torch.ops.kornia_tidy.occlusion_direct_gradients(*scene, list(places), gradient)
 
 
 def count_operations(
@@ -145,6 +154,7 @@ class _Scene(Parameters):
         *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "map_image", "map_row")),
         *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "mean", "stray_light", "out")),
         *((name, ctypes.c_void_p) for name in ("gradient", "psf_gradient", "stray_light_gradient")),
+        *PLACES,
     )
 
 
@@ -156,36 +166,41 @@ def _parameters(
     mean: Tensor | None = None,
     stray_light: Tensor | None = None,
     inside: Tensor | None = None,
+    places: Sequence[Tensor] = (),
 ) -> _Scene:
     index, weight = layer_index.to(plane.dtype), layer_weight
     if weight is not None:  # a pixel with a weight of one lies in the next layer alone
         full = weight == 1
         index, weight = index + full, weight.detach().to(plane.dtype).masked_fill(full, 0)
     if inside is not None:
-        index = index.masked_fill(inside == 0, len(psfs))
+        index = index.masked_fill(inside == 0, psfs.shape[-4])
     extra = (max(0, SMALLEST_SIDE - psfs.shape[-1]) // 2,) * 4
     if extra[0]:  # no light comes from there
         psfs, plane, index = pad(psfs, extra), pad(plane, extra), pad(index, extra, mode="replicate")
         weight = None if weight is None else pad(weight, extra, mode="replicate")
     side = psfs.shape[-1]
+    size = plane.shape[2] - side + 1, plane.shape[3] - side + 1
+    numbers, tensors = parameters_of(list(places), size, TILE, plane.dtype) if places else ({}, {})
     scene = _Scene(
         images=plane.shape[0],
         channels=plane.shape[1],
-        height=plane.shape[2] - side + 1,
-        width=plane.shape[3] - side + 1,
-        layers=len(psfs),
+        height=size[0],
+        width=size[1],
+        layers=psfs.shape[-4],
         side=side,
         map_image=index[0].numel() if len(index) > 1 else 0,
         map_row=index.shape[2],
+        **numbers,
     )
     scene.point_to(plane=plane.contiguous(), psfs=psfs.flip((-2, -1)).mT, index=index, weight=weight)
-    scene.point_to(mean=mean, stray_light=stray_light)
+    scene.point_to(mean=mean, stray_light=stray_light, **tensors)
     return scene
 
 
 def _new_light(*scene: Any) -> Tensor:
     """Check a scene and return the memory of its light, which is also the fake implementation."""
-    plane, psfs, layer_index, layer_weight, mean, stray_light, inside = scene
+    plane, psfs, layer_index, layer_weight, mean, stray_light, inside, places = scene
+    psfs = of_axis(psfs, places)
     check_light("plane", plane)
     check_dtypes(plane, layer_weight=layer_weight, mean=mean, stray_light=stray_light)
     check_psfs(psfs, plane)
@@ -196,6 +211,8 @@ def _new_light(*scene: Any) -> Tensor:
     if (mean is None) != (stray_light is None):
         only = "stray_light" if mean is None else "mean"
         raise ValueError(f"stray_light needs a mean and a mean needs stray_light, got only {only}")
+    if places and stray_light is not None:
+        raise ValueError("stray_light must be None where PSFs vary over the field")
     check_shape("layer_weight", layer_weight, tuple(layer_index.shape))
     check_shape("mean", mean, (batch, channels))
     check_shape("stray_light", stray_light, (psfs.shape[0], channels))
@@ -225,7 +242,7 @@ def _gradients(*scene_and_gradient: Any) -> list[Tensor]:
     found, parameters = _new_gradients(*scene_and_gradient), _parameters(*scene)
     of_psfs, *of_stray_light = found
     side, extra = of_psfs.shape[-1], (parameters.side - of_psfs.shape[-1]) // 2
-    columns = of_psfs.new_empty(*of_psfs.shape[:2], parameters.side, parameters.side)
+    columns = of_psfs.new_empty(*of_psfs.shape[:-2], parameters.side, parameters.side)
     parameters.point_to(gradient=gradient, psf_gradient=columns)
     if of_stray_light:
         parameters.point_to(stray_light_gradient=of_stray_light[0])
@@ -237,7 +254,7 @@ def _gradients(*scene_and_gradient: Any) -> list[Tensor]:
 
 _SCENE = (
     "Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, Tensor? mean, Tensor? stray_light,"
-    " Tensor? inside"
+    " Tensor? inside, Tensor[] places"
 )
 define("occlusion_direct", f"({_SCENE}) -> Tensor", _occlude, _new_light)
 define("occlusion_direct_gradients", f"({_SCENE}, Tensor gradient) -> Tensor[]", _gradients, _new_gradients)

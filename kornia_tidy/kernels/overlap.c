@@ -248,13 +248,6 @@ INLINE int thread_number(void) {
 #endif
 }
 
-// The numbers of the lanes.
-INLINE vec steps(void) {
-    vec x;
-    for (int i = 0; i < LANES; i++) x[i] = i;
-    return x;
-}
-
 // What all windows of one call share.
 typedef struct {
     const tiles *s;

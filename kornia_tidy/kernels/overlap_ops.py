@@ -7,7 +7,8 @@ plane L, in the pixels I and in the PSFs h:
 
 :func:`gather_overlap` is its derivative to I, :func:`scatter_overlap` to L and :func:`overlap_psf_gradient` to h.
 
-PSFs may vary over the field, see :class:`Places`: the PSF of a pixel y is then that of its tile, to first order.
+PSFs may vary over the field, see :class:`~kornia_tidy.kernels.places.Places`: the PSF of a pixel y is then that of its
+tile, to first order.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ import ctypes
 from collections.abc import Sequence
 from functools import cache
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, load
 from kornia_tidy.kernels.operators import Parameters, define
+from kornia_tidy.kernels.places import PLACES, Places, check_places, of_axis, parameters_of
 from kornia_tidy.kernels.scene_checks import new_pixels, new_plane, new_psfs, refuse_layer
 from kornia_tidy.kernels.window_sides import is_window_size, needed_side, size_step
 
@@ -43,46 +45,6 @@ def window_size(psf_side: int) -> int:
     step = size_step(torch.float32)
     sizes = count(step * max(1, -(-5 * psf_side // (2 * step))), step)
     return next(size for size in sizes if is_window_size(size, torch.float32))
-
-
-class Places(NamedTuple):
-    r"""Tiles of a picture with PSFs that are known at nodes over the field, along rows and along columns.
-
-    .. math:: h(y, x) = \sum_{ij} \left( a_i b_j + (y - y_0) \, a'_i b_j + (x - x_0) \, a_i b'_j \right) h_{ij}
-
-    Args:
-        row_edges: first row of each row of tiles and the end of the last, (R + 1,) int64 on a processor.
-        row_middles: :math:`y_0` of each row of tiles, (R,) float64.
-        row_weights: :math:`a_i` and :math:`a'_i` of each row of tiles, (R, 2, I) float64.
-        column_edges: the same along columns.
-        column_middles: as above.
-        column_weights: :math:`b_j` and :math:`b'_j`, (S, 2, J).
-    """
-
-    row_edges: Tensor
-    row_middles: Tensor
-    row_weights: Tensor
-    column_edges: Tensor
-    column_middles: Tensor
-    column_weights: Tensor
-
-    def of_pixels(self) -> Tensor:
-        """Return the weight of each node at each pixel, (I J, H, W) float64.
-
-        Example:
-            >>> one = torch.tensor([0, 1]), torch.zeros(1), torch.tensor([[[1.0], [0.0]]])
-            >>> two = torch.tensor([0, 3]), torch.ones(1), torch.tensor([[[0.5, 0.5], [-0.25, 0.25]]])
-            >>> Places(*one, *two).of_pixels().flatten(1)
-            tensor([[0.7500, 0.5000, 0.2500],
-                    [0.2500, 0.5000, 0.7500]])
-        """
-        values, slopes = [], []
-        for edges, middles, weights in (self[:3], self[3:]):
-            own, pixels = weights.repeat_interleave(edges.diff(), 0), torch.arange(int(edges[-1]))
-            values.append(own[:, 0].T)
-            slopes.append((own[:, 1] * (pixels - middles.repeat_interleave(edges.diff()))[:, None]).T)
-        (a, b), (y, x) = values, slopes
-        return ((a + y)[:, None, :, None] * b[:, None] + a[:, None, :, None] * x[:, None]).flatten(0, 1)
 
 
 def gather_overlap(
@@ -110,7 +72,8 @@ def gather_overlap(
         size: side of a window in samples, see :func:`~kornia_tidy.kernels.window_sides.is_window_size`, at least P.
         correlate: with PSFs that are flipped by 180 degrees.
         weight_gradient: return :math:`\partial I_c / \partial t` instead.
-        places: :class:`Places` of PSFs that vary over the field. Default: they are the same everywhere.
+        places: :class:`~kornia_tidy.kernels.places.Places` of PSFs that vary over the field. Default: they are the same
+            everywhere.
 
     Returns:
         (B, C, H, W). It has no gradient.
@@ -198,9 +161,7 @@ class _Tiles(Parameters):
         *((name, ctypes.c_int64) for name in ("pixels_image", "pixels_channel", "pixels_row")),
         *((name, ctypes.c_int64) for name in ("index_image", "index_row", "weight_image", "weight_row")),
         *((name, ctypes.c_void_p) for name in ("psfs", "index", "weight", "plane", "pixels", "out")),
-        *((name, ctypes.c_int64) for name in ("node_rows", "node_columns", "down", "across")),
-        *((name, ctypes.c_void_p) for name in ("row_edges", "column_edges", "row_middles", "column_middles")),
-        *((name, ctypes.c_void_p) for name in ("row_weights", "column_weights")),
+        *PLACES,
     )
 
 
@@ -219,13 +180,10 @@ def _call(
     (images, height, width), (layers, channels, side, _) = labels[0].shape, like_psfs.shape[-4:]
     step, largest, own = size_step(out.dtype), (height, width), {}
     if places:
-        given = Places(*places)
-        for edges, pixels in ((given.row_edges, height), (given.column_edges, width)):
-            _check_edges(edges, pixels, size - side + 1)
-        largest = int(given.row_edges.diff().max()), int(given.column_edges.diff().max())
-        own = {"node_rows": like_psfs.shape[0], "node_columns": like_psfs.shape[1]}
-        own |= {"down": len(given.row_middles), "across": len(given.column_middles)}
-        tensors |= {name: x if x.dtype == torch.int64 else x.to(out.dtype) for name, x in given._asdict().items()}
+        most = size - side + 1
+        own, more = parameters_of(places, (height, width), (most, most), out.dtype)
+        largest = int(more["row_edges"].diff().max()), int(more["column_edges"].diff().max())
+        tensors |= more
     tiles = _Tiles(
         images=images,
         channels=channels,
@@ -257,38 +215,6 @@ def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
         )
 
 
-def _check_places(places: list[Tensor], nodes: tuple[int, ...]) -> None:
-    """Refuse places with tensors that do not fit one another or the nodes. Looks at no value."""
-    given = Places(*places)
-    for axis, many in zip((given[:3], given[3:]), nodes, strict=True):
-        edges, middles, weights = axis
-        tiles = tuple(middles.shape)
-        if (tuple(edges.shape), tuple(weights.shape)) != ((len(middles) + 1,), (*tiles, 2, many)):
-            shapes = ", ".join(str(tuple(x.shape)) for x in axis)
-            raise ValueError(
-                f"places must be n + 1 edges, n middles and (n, 2, {many}) weights of nodes, got shapes {shapes}"
-            )
-
-
-def _check_edges(edges: Tensor, pixels: int, largest: int) -> None:
-    """Refuse tiles that do not cover the pixels of an axis or do not fit into windows."""
-    tiles = edges.diff()
-    if edges[0] != 0 or edges[-1] != pixels or tiles.min() < 1 or tiles.max() > largest:
-        raise ValueError(
-            f"edges of tiles must ascend from 0 to {pixels} by {largest} at most, got {edges.tolist()!s:.80}"
-        )
-
-
-def _of_axis(psfs: Tensor, places: list[Tensor]) -> Tensor:
-    """Return the PSFs of a node where there are places, and refuse wrong places."""
-    if not places:
-        return psfs
-    if psfs.ndim != 6 or 0 in psfs.shape[:2]:
-        raise ValueError(f"psfs over the field must have shape (I, J, D, C, P, P), got {tuple(psfs.shape)}")
-    _check_places(places, psfs.shape[:2])
-    return psfs[0, 0]
-
-
 def _new_pixels(
     plane: Tensor,
     psfs: Tensor,
@@ -299,7 +225,7 @@ def _new_pixels(
     weight_gradient: bool,
     places: list[Tensor],
 ) -> Tensor:
-    out = new_pixels(plane, _of_axis(psfs, places), index, weight, weight_gradient)
+    out = new_pixels(plane, of_axis(psfs, places), index, weight, weight_gradient)
     _check_size(size, psfs.shape[-1], psfs.dtype)
     return out
 
@@ -313,7 +239,7 @@ def _new_plane(
     correlate: bool,
     places: list[Tensor],
 ) -> Tensor:
-    out = new_plane(pixels, _of_axis(psfs, places), index, weight)
+    out = new_plane(pixels, of_axis(psfs, places), index, weight)
     _check_size(size, psfs.shape[-1], psfs.dtype)
     return out
 
@@ -333,7 +259,7 @@ def _new_psfs(
     if not places:
         return out
     nodes = Places(*places).row_weights.shape[-1], Places(*places).column_weights.shape[-1]
-    _check_places(places, nodes)
+    check_places(places, nodes)
     return out.new_zeros(*nodes, *out.shape)
 
 

@@ -33,6 +33,13 @@ INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
 INLINE vec all(REAL x) { return x - (vec){0}; }
 
+// The numbers of the lanes.
+INLINE vec steps(void) {
+    vec x;
+    for (int i = 0; i < LANES; i++) x[i] = i;
+    return x;
+}
+
 INLINE bits bits_of(vec x) {
     bits same;
     memcpy(&same, &x, sizeof same);

@@ -31,6 +31,7 @@ class Field:
         origin: row and column in the picture of the first pixel of the light that is rendered: negative where a border
             was added, and above zero in a lower strip.
         cell: side in pixels of the largest cells in which PSFs are taken to first order about the middle.
+        still: side in pixels of the largest cells in which PSFs may be taken as in the middle.
 
     Convention:
         - The middle of the picture is at ``(size - 1) / 2``. PSFs beyond the picture, as of a border, are those of the
@@ -49,6 +50,7 @@ class Field:
     center: tuple[float, float] = (0.0, 0.0)
     origin: tuple[int, int] = (0, 0)
     cell: int = 64
+    still: int = 0
 
     @property
     def points(self) -> tuple[tuple[float, float], ...]:

@@ -106,6 +106,11 @@ class FieldBank:
             )
         return replace(self, veil=(1 - self.energy).clamp(min=0) * self.light if kind == "veil" else None)
 
+    def with_all_light(self) -> FieldBank:
+        """Return a bank with PSFs that sum to ``light``, whatever was done about light outside the window."""
+        total = self.psfs.sum((-2, -1)).clamp(min=torch.finfo(self.psfs.dtype).tiny)
+        return replace(self, psfs=self.psfs * (self.light / total)[..., None, None])
+
 
 @on_cpu
 def check_field(field: Sequence[tuple[float, float]], lens: Lens | None) -> list[tuple[float, float]]:

@@ -54,6 +54,8 @@ def field_nodes(
         reach: pixels from the PSF's middle within which most of its light falls.
         tolerance: relative error of the PSFs. A warning tells where :data:`MOST_NODES` leave more.
 
+    PSFs are taken as constant in cells in which their first order stays within the tolerance.
+
     Example:
         >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2)
         >>> whole = field_nodes((1110, 1282), (0.0, 0.0), lens, *given)
@@ -62,7 +64,7 @@ def field_nodes(
         >>> field_nodes((64, 64), (0.0, 0.0), lens, *given).nodes
         (1, 1)
     """
-    found, cell, beyond = [], CELLS[1], 0.0
+    found, cell, still, beyond = [], CELLS[1], CELLS[1], 0.0
     for axis in (0, 1):
         half = (size[axis] - 1) / 2
         errors = torch.zeros(MOST_NODES + 1, dtype=torch.float64)
@@ -71,10 +73,11 @@ def field_nodes(
             points = [(center[axis] + half * x, center[1 - axis] + beside) for x in chebyshev_points(_KNOWN)]
             places = [point if axis == 0 else point[::-1] for point in points]
             phases = _phases(lens, places, defocus, wavelength, pixel_pitch, reach)
-            of_nodes, bend = _errors(phases)
+            of_nodes, slope, bend = _errors(phases)
             errors = torch.maximum(errors, of_nodes)
             fitting = 2 * half * math.sqrt(tolerance / bend) if bend > 0 else math.inf
             cell = max(CELLS[0], int(min(cell, fitting)))
+            still = int(min(still, 2 * half * tolerance / slope)) if slope > 0 else still
         enough = (errors[1:] <= tolerance).nonzero()
         beyond = max(beyond, 0.0 if len(enough) else float(errors[-1]))
         found.append(int(enough[0]) + 1 if len(enough) else MOST_NODES)
@@ -86,13 +89,14 @@ def field_nodes(
             UserWarning,
             stacklevel=3,
         )
-    return Field(size, (found[0], found[1]), center, cell=cell)
+    return Field(size, (found[0], found[1]), center, cell=cell, still=still)
 
 
-def _errors(phases: Tensor) -> tuple[Tensor, float]:
+def _errors(phases: Tensor) -> tuple[Tensor, float, float]:
     """Return the error of the factors of all pairs for each number of nodes, the first entry standing for none.
 
-    And that of their first order in a cell as long as the line, were it to follow the second order.
+    And those of their value and of their first order in a cell as long as the line, were they to follow the first and
+    the second order.
     """
     fine = torch.linspace(-1, 1, 4 * _KNOWN, dtype=torch.float64)
 
@@ -107,7 +111,9 @@ def _errors(phases: Tensor) -> tuple[Tensor, float]:
         errors.append(float((between - exact).abs().square().mean(-1).sqrt().max()))
     second = exact.diff(n=2, dim=0) / float(fine[1] - fine[0]) ** 2  # f'' (x^2 - 1 / 3) / 2 is left, see Field.tiles
     bend = float(second.abs().square().mean(-1).sqrt().max()) / math.sqrt(45)
-    return torch.tensor(errors, dtype=torch.float64), bend
+    first = exact.diff(dim=0) / float(fine[1] - fine[0])  # f' x is left
+    slope = float(first.abs().square().mean(-1).sqrt().max()) / math.sqrt(3)
+    return torch.tensor(errors, dtype=torch.float64), slope, bend
 
 
 def _phases(

@@ -97,7 +97,7 @@ def render_layers(
     if nodes.device.type != "cpu" and Mode.UNREAD not in mode:
         check_nodes(nodes)
     render = _rendered if Mode.TRANSFORM in mode else torch.ops.kornia_tidy.render_layers
-    over = [] if field is None else [*field.size, *field.nodes, *field.origin, field.cell]
+    over = [] if field is None else [*field.size, *field.nodes, *field.origin, field.cell, field.still]
     return render(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, over, method)
 
 
@@ -123,7 +123,8 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         return BACKENDS["batched"]
     side = scene.psfs.shape[-1]
     if BACKENDS["compiled"].refusal(scene) is None:
-        name, large = "compiled", scene.compositing == "occlusion" and side > LARGEST_OCCLUSION
+        large_psfs = scene.compositing == "occlusion" and side > LARGEST_OCCLUSION
+        name, large = "compiled", large_psfs and scene.field is None
     else:
         name, large = "batched", side >= LARGEST_SHARE * min(scene.output_size)
     return BACKENDS["dense" if large and _keeps_little(scene) else name]
@@ -213,8 +214,8 @@ torch.library.define("kornia_tidy::render_layers_gradients", f"({_SCENE}, Tensor
 
 
 def _field(numbers: Sequence[int]) -> Field:
-    rows, columns, down, across, top, left, cell = numbers
-    return Field((rows, columns), (down, across), origin=(top, left), cell=cell)
+    rows, columns, down, across, top, left, cell, still = numbers
+    return Field((rows, columns), (down, across), origin=(top, left), cell=cell, still=still)
 
 
 def _rendered(*arguments: Any) -> Tensor:

@@ -8,7 +8,8 @@ is taken to first order about the cell's middle:
 
 Gather is linear in the PSFs, so that any backend renders a cell. In scatter the PSF is that of the pixel where light
 comes from, and its factors y and x stand before the sum. Occlusion divides, so the planes that it divides are blended
-and not the pictures: the PSF is that of the pixel that sees.
+and not the pictures: the PSF is that of the pixel that sees. Compiled occlusion has gradients of the PSFs; with
+those of light and defocus all are the gradients of cells, for the light that the compiled code renders.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ from kornia_tidy.mode import torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.render.backend import wants_gradient
 from kornia_tidy.render.backends.dense_occlusion import cumulative_weight, lay_over
 from kornia_tidy.render.borders import check_border, cropped, from_spectrum, pad_border, to_spectrum
-from kornia_tidy.render.dispatch import Rendering, render_layers
+from kornia_tidy.render.dispatch import BACKENDS, Rendering, render_layers
 from kornia_tidy.render.layers import present_layers, weight_of_layer
-from kornia_tidy.render.scene import assign_layers
+from kornia_tidy.render.scene import assign_layers, layered_scene
 from kornia_tidy.render.stray_light import spread_evenly
 
 
@@ -61,35 +63,45 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     """
     radius, border = bank.window // 2, rendering.border
     check_border(border, *light.shape[-2:], bank.window)
-    alike = field.nodes == (1, 1) and rendering.compositing != "occlusion"
-    if alike or _is_compiled(light, bank, rendering):
-        given = light, defocus, bank.defocus, bank.psfs[0] if alike else bank.psfs, None
-        seen = render_layers(*given, **asdict(rendering), field=None if alike else field)
-        return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
+    occludes = rendering.compositing == "occlusion"
+    if occludes and bank.veil is not None:
+        raise ValueError(
+            "stray_light 'veil' cannot be spread behind things that hide where PSFs vary over the picture: take a "
+            "fidelity with stray_light='renormalize' or 'discard', or compositing 'gather' or 'scatter'"
+        )
+    alike, tiled = field.nodes == (1, 1) and not occludes, None
+    if alike or _is_compiled(light, defocus, bank, field, rendering):
+        psfs = bank.with_all_light().psfs if occludes else bank.psfs  # which it divides by
+        given = light, defocus, bank.defocus, psfs[0] if alike else psfs, None
+        whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus, bank.light))))
+        with torch.set_grad_enabled(whole and torch.is_grad_enabled()):
+            tiled = render_layers(*given, **asdict(rendering), field=None if alike else field)
+        if whole:
+            return tiled if bank.veil is None else tiled + _veil(light, defocus, bank, field, rendering)
     plane, deep, inside, around = light, defocus, None, field
     if border != "valid":
         plane = pad_border(light, radius, border)
         deep = pad_border(defocus, radius, "replicate" if border == "zero" else border)
         around = field.moved(-radius, -radius)
-    if rendering.compositing == "occlusion":
-        if bank.veil is not None:
-            raise ValueError(
-                "stray_light 'veil' cannot be spread behind things that hide where PSFs vary over the picture: take a "
-                "fidelity with stray_light='renormalize' or 'discard', or compositing 'gather' or 'scatter'"
-            )
-        if border == "zero":
-            inside = pad_border(torch.ones_like(light[:1, :1]), radius, "zero")
+    if occludes and border == "zero":
+        inside = pad_border(torch.ones_like(light[:1, :1]), radius, "zero")
     cells = _Cells(bank, around, rendering)
     seen = cells.scatter(plane, deep) if rendering.compositing == "scatter" else cells.see(plane, deep, inside)
+    if tiled is not None:
+        seen = seen + (tiled - seen).detach()
     return seen if bank.veil is None else seen + _veil(light, defocus, bank, field, rendering)
 
 
-def _is_compiled(light: Tensor, bank: FieldBank, rendering: Rendering) -> bool:
-    """Return whether the compiled backend takes PSFs over the field: for occlusion and elsewhere cells are rendered."""
+def _is_compiled(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> bool:
+    """Return whether the compiled backend takes PSFs over the field: elsewhere cells are rendered."""
     dtype = torch.promote_types(torch.promote_types(light.dtype, bank.psfs.dtype), torch.float32)
-    if rendering.compositing == "occlusion" or torch_mode():
+    if torch_mode() or light.device.type != "cpu" or compiled(SOURCE, dtype) is None:
         return False
-    return light.device.type == "cpu" and compiled(SOURCE, dtype) is not None
+    if rendering.compositing != "occlusion":
+        return True
+    options = rendering.layers, rendering.border, rendering.correlate
+    scene = layered_scene(light, defocus, bank.defocus, bank.psfs.detach(), None, "occlusion", *options, field)
+    return BACKENDS["compiled"].refusal(scene) is None
 
 
 def _veil(light: Tensor, defocus: Tensor, bank: FieldBank, field: Field, rendering: Rendering) -> Tensor:

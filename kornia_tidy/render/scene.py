@@ -16,7 +16,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_choice, check_float_tensor
-from kornia_tidy.kernels.overlap_ops import Places, window_size
+from kornia_tidy.kernels.occlusion_ops import TILE
+from kornia_tidy.kernels.overlap_ops import window_size
+from kornia_tidy.kernels.places import Places
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.borders import BORDERS, PAD_MODES, check_border, pad_border, padded_size
@@ -120,7 +122,8 @@ class LayeredScene:
     def places(self) -> Places:
         """Tiles over the field and the nodes' weights there: at the pixels that see, for scatter at those of the light.
 
-        Tiles are as large as suits the PSFs, but not larger than the field's cells.
+        Tiles are as large as suits the PSFs, but not larger than the field's cells. Those of occlusion are small, and
+        without gradients along an axis where PSFs hardly change in them.
         """
         if "places" not in self.found:
             assert self.field is not None
@@ -128,9 +131,15 @@ class LayeredScene:
             scatters, valid = self.compositing == "scatter", self.border == "valid"
             sides, beyond = (self.padded_size, side // 2) if scatters else (self.output_size, 0)
             moved = side // 2 * (valid - scatters)
-            most = min(self.field.cell, window_size(side) - side + 1)
-            rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most, beyond) for i in (0, 1))
-            self.found["places"] = Places(*rows, *columns)
+            most = (min(self.field.cell, window_size(side) - side + 1),) * 2
+            if self.compositing == "occlusion":
+                most = TILE
+            rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond) for i in (0, 1))
+            places = Places(*rows, *columns)
+            if self.compositing == "occlusion":
+                for weights, pixels in ((places.row_weights, TILE[0]), (places.column_weights, TILE[1])):
+                    weights[:, 1] *= pixels > self.field.still
+            self.found["places"] = places
         return self.found["places"]
 
     @property

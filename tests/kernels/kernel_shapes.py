@@ -19,9 +19,10 @@ from torch import Tensor
 from torch.nn.functional import conv2d, one_hot
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
-from kornia_tidy.kernels.overlap_ops import Places
+from kornia_tidy.kernels.places import Places
 from kornia_tidy.kernels.window_sides import is_window_size, size_step
 from kornia_tidy.psf.energies import LARGEST_WINDOW
+from kornia_tidy.psf.field import Field
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.dense_occlusion import (
     EPSILON,
@@ -224,14 +225,28 @@ def occlude(draw: random.Random) -> Call:
     through is a difference and keeps its absolute error, which grows with each layer, and so does the sum of layers. In
     float64 whole weights come from differences of sums up to 1, which a layer seen by a single pixel is divided by.
     """
-    arguments, scene, about, products = _occluding(draw)
-    psfs = arguments[1]
+    return _occlude(_occluding(draw))
+
+
+def field_occlude(draw: random.Random) -> Call:
+    """``occlude`` of occlusion.c with PSFs that vary over the field: up to three planes for each."""
+    return _occlude(_occluding_over_field(draw))
+
+
+def _occlude(drawn: tuple[tuple[Any, ...], LayeredScene, str, int]) -> Call:
+    arguments, scene, about, products = drawn
+    psfs = arguments[1] if scene.field is None else arguments[1][0, 0]
     assert occlusion_ops.count_operations(*arguments[2:4], psfs, len(arguments[0])) >= 0, about
 
     def truth() -> tuple[Tensor, float]:
-        return DenseBackend().render(scene), 6 * _occlusion_error(psfs, psfs.shape[-1] ** 2 + 16)
+        return DenseBackend().render(scene), 6 * _terms(scene) * _occlusion_error(psfs, psfs.shape[-1] ** 2 + 16)
 
     return Call(about, "occlusion_direct", arguments, products, truth)
+
+
+def _terms(scene: LayeredScene) -> int:
+    """Sums and their magnitude for each sum of one PSF: nodes are blended, and slopes weighted and added."""
+    return 1 if scene.field is None else 3 * sum(scene.field.nodes)
 
 
 def occlude_gradient(draw: random.Random) -> Call:
@@ -241,11 +256,35 @@ def occlude_gradient(draw: random.Random) -> Call:
     g that is g T / E for light, twice as much for alpha, and as much times alpha / E for E. Products of these with
     light and weights are summed in the light's type along a band of blocks.
     """
-    arguments, scene, about, products = _occluding(draw)
+    return _occlude_gradient(_occluding(draw))
+
+
+def field_occlude_gradient(draw: random.Random) -> Call:
+    """``occlusion_gradients`` of occlusion.c for the PSFs at the nodes of a field."""
+    return _occlude_gradient(_occluding_over_field(draw))
+
+
+def _occlude_gradient(drawn: tuple[tuple[Any, ...], LayeredScene, str, int]) -> Call:
+    arguments, scene, about, products = drawn
     psfs = arguments[1]
     gradient = torch.randn(*scene.image.shape[:2], *scene.output_size, dtype=psfs.dtype)
 
+    def over_field() -> tuple[Tensor, Tensor]:
+        exact, shares = scene.psfs.detach().double().clone().requires_grad_(), scene.places.of_pixels()
+        planes = occlusion_planes(scene)._replace(psfs=exact)
+        (expected,) = torch.autograd.grad((occlude_dense(*planes, shares) * gradient).sum(), exact)
+        one, roundings = psfs[0, 0], psfs.shape[-1] ** 2 + 16 + 8 * gradient.shape[-1] + gradient.shape[-2]
+        # The nodes' magnitudes are the largest; a PSF's light adds as much as light itself, to all samples.
+        axis = planes._replace(psfs=torch.stack(list(scene.psfs)).amax(0).double().requires_grad_())
+        magnitude = _occlusion_magnitude(axis, gradient.abs())
+        magnitude = 2 * (magnitude + magnitude.amax((-2, -1), keepdim=True))
+        bound = 12 * _terms(scene) * _occlusion_error(one, roundings) * magnitude
+        nodes = expected.unflatten(0, psfs.shape[:2])
+        return nodes, bound.expand_as(nodes)
+
     def truth() -> tuple[Tensor, Tensor]:
+        if scene.field is not None:
+            return over_field()
         exact = psfs.detach().double().clone().requires_grad_()
         planes = occlusion_planes(scene)._replace(psfs=exact)
         (expected,) = torch.autograd.grad((occlude_dense(*planes) * gradient).sum(), exact)
@@ -310,7 +349,30 @@ def _occluding(draw: random.Random) -> tuple[tuple[Any, ...], LayeredScene, str,
         at, mode = at + fraction[:, None], "linear"
     nodes = torch.arange(layers, dtype=torch.float64)
     scene = layered_scene(image, at, nodes, psfs, veil, "occlusion", mode, border)
-    return (plane, psfs, below, share, mean, seen, inside), scene, about, products
+    return (plane, psfs, below, share, mean, seen, inside, []), scene, about, products
+
+
+def _occluding_over_field(draw: random.Random) -> tuple[tuple[Any, ...], LayeredScene, str, int]:
+    """As above with PSFs at nodes over the field, tiles of any sizes, and no stray light."""
+    drawn = _occluding(draw)
+    while drawn[1].stray_light is not None or drawn[3] > LARGEST / 9:
+        drawn = _occluding(draw)
+    arguments, scene, about, products = drawn
+    nodes, parts = (draw.randint(1, 3), draw.randint(1, 3)), []
+    for pixels, most, many in zip(scene.output_size, occlusion_ops.TILE, nodes, strict=True):
+        edges = [0]
+        while edges[-1] < pixels:
+            edges.append(min(pixels, edges[-1] + draw.choice((most, most, draw.randint(1, most)))))
+        middles = torch.tensor(edges[1:], dtype=torch.float64) - 8 * torch.rand(len(edges) - 1, dtype=torch.float64)
+        weights = torch.rand(len(edges) - 1, 2, many, dtype=torch.float64) + 0.5
+        weights[:, 1] = (weights[:, 1] - 1) * draw.choice((0, 0.01, 0.01))  # PSFs stay above zero
+        weights[:, 0] /= weights[:, 0].sum(-1, keepdim=True)
+        parts += [torch.tensor(edges), middles, weights]
+    psfs = arguments[1] * (0.75 + 0.5 * torch.rand(*nodes, *arguments[1].shape, dtype=arguments[1].dtype))
+    field, found = Field(scene.output_size, nodes), {"places": Places(*parts)}
+    scene = replace(scene, psfs=psfs.flatten(0, 1), field=field, found=found)
+    about = f"{about} nodes {nodes} tiles {len(parts[1])}x{len(parts[4])}"
+    return (arguments[0], psfs, *arguments[2:7], parts), scene, about, math.prod(nodes) * products
 
 
 def energies(draw: random.Random) -> Call:
@@ -528,6 +590,8 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "direct.c: correlate": correlate,
     "occlusion.c: light": occlude,
     "occlusion.c: gradient": occlude_gradient,
+    "occlusion.c: light over the field": field_occlude,
+    "occlusion.c: gradient over the field": field_occlude_gradient,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
     "srgb.c: values": srgb,

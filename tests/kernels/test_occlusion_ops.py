@@ -81,6 +81,36 @@ class TestOcclusionDirect(SceneOperatorTester):
         with pytest.raises(error, match=words):
             occlusion_direct(**scene(**changes))
 
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            (
+                {"psfs": torch.ones(1, 1, 3, 2, 3, 3), "mean": torch.ones(2, 2), "stray_light": torch.ones(3, 2)},
+                "stray_light must be None where PSFs vary",
+            ),
+            ({}, r"over the field must have shape \(I, J, D, C, P, P\), got \(3, 2, 3, 3\)"),
+        ],
+    )
+    def test_exception_over_the_field(self, changes, words):
+        axis = torch.tensor([0, 9]), torch.zeros(1), torch.tensor([[[1.0], [0.0]]])
+        with pytest.raises(ValueError, match=words):
+            occlusion_direct(**scene(**changes), places=[*axis, torch.tensor([0, 32]), *axis[1:]])
+
+    @needs_compiler
+    def test_exception_tiles_that_are_too_large(self):
+        one, two = (torch.tensor([[1.0], [0.0]]).expand(n, -1, -1) for n in (1, 2))
+        places = [torch.tensor([0, 9]), torch.zeros(1), one, torch.tensor([0, 16, 32]), torch.zeros(2), two]
+        with pytest.raises(ValueError, match=r"must ascend from 0 to 9 by 8 at most, got \[0, 9\]"):
+            occlusion_direct(**scene(psfs=torch.ones(1, 1, 3, 2, 3, 3)), places=places)
+
+
+class TestOcclusionOverField(SceneOperatorTester):
+    draw = staticmethod(kernel_shapes.field_occlude)
+    source = SOURCE
+
+    def smallest(self):
+        return occlusion_direct(**scene())
+
 
 class TestOcclusionDirectGradients(SceneOperatorTester):
     draw = staticmethod(kernel_shapes.occlude_gradient)
@@ -89,7 +119,8 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
     def test_cardinality_tensors_without_memory(self):
         """Of a list, and so not as for the other operators."""
         arguments = kernel_shapes.occlude_gradient(random.Random(1)).arguments
-        found = occlusion_direct_gradients(*(None if x is None else x.to("meta") for x in arguments))
+        *planes, _, gradient = arguments
+        found = occlusion_direct_gradients(*(None if x is None else x.to("meta") for x in (*planes, gradient)))
         given = [x for x in (arguments[1], arguments[5]) if x is not None]
         assert [(x.shape, x.dtype, x.is_meta) for x in found] == [(x.shape, x.dtype, True) for x in given]
 
@@ -106,16 +137,24 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
         return occlusion_direct_gradients(**scene(), mean=None, stray_light=None, inside=None, gradient=gradient)
 
     @needs_compiler
+    @pytest.mark.parametrize("draw", [kernel_shapes.occlude_gradient, kernel_shapes.field_occlude_gradient])
     @pytest.mark.parametrize("threads", [1, 3, 50])
-    def test_feature_the_same_every_time_with_as_many_threads(self, threads):
-        before, arguments = torch.get_num_threads(), kernel_shapes.occlude_gradient(random.Random(3)).arguments
+    def test_feature_the_same_every_time_with_as_many_threads(self, threads, draw):
+        before, call = torch.get_num_threads(), draw(random.Random(3))
         try:
             torch.set_num_threads(threads)
-            first, second = (occlusion_direct_gradients(*arguments)[0] for _ in range(2))
+            first, second = (call.operator(*call.arguments)[0] for _ in range(2))
         finally:
             torch.set_num_threads(before)
         assert torch.equal(first, second)
-        assert (first - occlusion_direct_gradients(*arguments)[0]).norm() <= 1e-5 * first.norm()
+        assert (first - call.operator(*call.arguments)[0]).norm() <= 1e-5 * first.norm()
+
+    @needs_compiler
+    @pytest.mark.parametrize("seed", range(12))
+    def test_feature_over_the_field_within_round_off(self, seed):
+        torch.manual_seed(seed)
+        call = kernel_shapes.field_occlude_gradient(random.Random(seed))
+        assert call.error() <= 1, call.about
 
     def test_exception(self):
         with pytest.raises(ValueError, match=r"gradient must have shape \(2, 2, 9, 32\), got \(3,\)"):

@@ -9,11 +9,11 @@ import torch
 
 from kornia_tidy.kernels.overlap_ops import (
     SOURCE,
-    Places,
     gather_overlap,
     overlap_psf_gradient,
     scatter_overlap,
 )
+from kornia_tidy.kernels.places import Places
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import SceneOperatorTester, needs_compiler
 

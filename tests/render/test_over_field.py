@@ -47,10 +47,10 @@ def scene_of(dtype=torch.float64, batch: int = 2) -> tuple[torch.Tensor, torch.T
 class TestRenderOverField(BaseTester):
     @pytest.mark.parametrize("nodes", [(3, 2), (1, 3), (2, 1)])
     @pytest.mark.parametrize("border", BORDERS)
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_feature_tiles_equal_the_sum_over_nodes(self, compositing, border, nodes):
-        field = Field(SIZE, nodes, cell=20)
-        (light, defocus), bank = scene_of(), bank_over(field)
+        field = Field(SIZE, nodes, cell=20, still=10 if border == "valid" else 0)
+        (light, defocus), bank = scene_of(), bright(bank_over(field))
         given = light, defocus, bank.defocus, bank.psfs, None
         options = {"compositing": compositing, "border": border, "layers": "linear", "correlate": border == "zero"}
         tiles, whole = (render_layers(*given, method=name, field=field, **options) for name in ("compiled", "dense"))
@@ -71,6 +71,31 @@ class TestRenderOverField(BaseTester):
             found.append(torch.autograd.grad(seen, wanted, gradient))
         for own, expected in zip(*found, strict=True):
             self.assert_close(own, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+
+    @pytest.mark.parametrize("layers", ["linear", "nearest"])
+    @pytest.mark.parametrize("border", ["reflect", "zero"])
+    def test_feature_gradients_of_psfs_that_hide_equal_those_of_the_sum_over_nodes(self, layers, border):
+        field = Field(SIZE, (3, 2))
+        bank, gradient = bright(bank_over(field)), torch.randn(2, 2, *SIZE, dtype=torch.float64)
+        psfs, found = bank.psfs.requires_grad_(), []
+        for method in ("compiled", "dense"):
+            options = {"compositing": "occlusion", "border": border, "layers": layers, "correlate": False}
+            seen = render_layers(*scene_of(), bank.defocus, psfs, None, method=method, field=field, **options)
+            found.append(torch.autograd.grad(seen, psfs, gradient)[0])
+        self.assert_close(*found, rtol=0, atol=1e-12 * float(found[1].abs().max()))
+
+    def test_feature_light_and_defocus_have_gradients_behind_what_hides(self):
+        """By cells: with one node they see what tiles see."""
+        field = Field(SIZE, (1, 1))
+        bank = bright(bank_over(field))
+        leaves, rendering = [x.requires_grad_() for x in scene_of()], Rendering("occlusion", "reflect")
+        seen = render_over_field(*leaves, bank, field, rendering)
+        options = {"method": "compiled", "field": field, "layers": "linear", "correlate": False}
+        given = *leaves, bank.defocus, bank.with_all_light().psfs, None
+        expected = render_layers(*given, compositing="occlusion", border="reflect", **options)
+        self.assert_close(seen, expected, rtol=0, atol=1e-6)  # the divisors have another EPSILON
+        for one, other in zip(*(torch.autograd.grad(x.square().sum(), leaves) for x in (seen, expected)), strict=True):
+            self.assert_close(one, other, rtol=0, atol=1e-4 * float(other.abs().max()))
 
     @pytest.mark.parametrize(("real", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
     @pytest.mark.parametrize("compositing", ["gather", "scatter"])
@@ -97,10 +122,10 @@ class TestRenderOverField(BaseTester):
         cells = render_over_field(light, defocus, bank, field, Rendering(compositing, border))
         self.assert_close(tiles, cells, rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_feature_parts_of_a_picture_are_those_of_the_whole(self, compositing):
         field = Field(SIZE, (3, 2), cell=25)
-        (light, defocus), bank = scene_of(), bank_over(field)
+        (light, defocus), bank = scene_of(), bright(bank_over(field))
         whole = render_over_field(light, defocus, bank, field, Rendering(compositing, "valid"))
         part = light[..., 13:60, 7:], defocus[..., 13:60, 7:]
         own = render_over_field(*part, bank, field.moved(13, 7), Rendering(compositing, "valid"))
@@ -130,6 +155,10 @@ class TestRenderOverField(BaseTester):
         works = [BACKENDS["compiled"].work(axis)]
         works += [BACKENDS["compiled"].work(layered_scene(*given, field=Field(SIZE, (3, 2), cell=c))) for c in (32, 16)]
         assert works[0].operations < 1.5 * works[0].operations < works[1].operations < works[2].operations
+        hiding = (layered_scene(*given, compositing="occlusion", field=Field(SIZE, (3, 2), still=n)) for n in (20, 0))
+        still, moving = (BACKENDS["compiled"].work(x).operations for x in hiding)
+        axis = BACKENDS["compiled"].work(layered_scene(*given[:3], bank.psfs[0], compositing="occlusion")).operations
+        assert axis < still < moving
         told = str(explain(layered_scene(*given, field=field)))
         assert "3 of 3 layers, PSFs of 9x9 px at 3x2 places over the picture: compiled" in told
         assert "batched: PSFs that vary over the picture are rendered cell by cell" in told
@@ -146,9 +175,14 @@ class TestRenderOverField(BaseTester):
         (light, defocus), bank = scene_of(), bank_over(field)
         options = {"border": "reflect", "layers": "linear", "correlate": False, "field": field}
         given = light, defocus, bank.defocus, bank.psfs, None
-        for method, compositing in (("batched", "gather"), ("compiled", "occlusion"), ("dense", "occlusion")):
-            with pytest.raises(ValueError, match=f"method '{method}' does not .* vary over the picture .*cell by cell"):
-                render_layers(*given, compositing=compositing, method=method, **options)
+        for compositing in ("gather", "occlusion"):
+            with pytest.raises(ValueError, match=r"method 'batched' does not .* vary over the picture .*cell by cell"):
+                render_layers(*given, compositing=compositing, method="batched", **options)
+
+
+def bright(bank: FieldBank) -> FieldBank:
+    """The bank with PSFs above zero everywhere, as occlusion needs them."""
+    return replace(bank, psfs=bank.psfs - bank.psfs.min() + 1e-3)
 
 
 def _without_product(values: torch.Tensor) -> torch.Tensor:

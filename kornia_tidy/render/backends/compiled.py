@@ -9,6 +9,8 @@ image and depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -20,7 +22,7 @@ from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.batched import BatchedBackend
-from kornia_tidy.render.backends.dense import OCCLUSION_OVER_FIELD
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.layer_sums import blend_gradients, seen
 from kornia_tidy.render.backends.tiles import Grid
@@ -55,8 +57,6 @@ class CompiledBackend:
             return "it needs a C compiler (see `kornia-tidy info`)"
         if not occludes:
             return None
-        if scene.field is not None:
-            return OCCLUSION_OVER_FIELD
         if not _fits(scene, smallest := occlusion_ops.smallest_output(image.dtype)):
             least, size = ("x".join(map(str, sides)) for sides in (smallest, scene.output_size))
             return f"its occlusion needs an output of at least {least} pixels, got {size}"
@@ -74,8 +74,7 @@ class CompiledBackend:
         """Return the rendered light."""
         keep_memory()
         if scene.compositing == "occlusion":
-            light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
-            return occlusion_direct(light, psfs, index, weight, mean, stray_light, inside)
+            return occlusion_direct(*_occlusion(scene))
         sums = _Sums(scene)
         if scene.compositing == "gather":
             return sums.gather(scene.plane)
@@ -94,8 +93,13 @@ class CompiledBackend:
         pixels, itemsize = batch * scene.output_size[0] * scene.output_size[1], scene.image.element_size()
         image, words = channels * labels.layer_index.numel() * itemsize, channels * itemsize // 4
         if scene.compositing == "occlusion":
-            operations = words * occlusion_ops.count_operations(*scene.sorted_layers, scene.psfs, batch)
-            return Work(operations, 2 * image + 32 * labels.layer_index.numel())
+            one = scene.psfs if scene.field is None else scene.psfs[0]
+            operations, tables = words * occlusion_ops.count_operations(*scene.sorted_layers, one, batch), 0
+            if scene.field is not None:  # each block makes its PSFs, and may blur by the value and two gradients
+                moving = sum(bool(x[:, 1].any()) for x in (scene.places.row_weights, scene.places.column_weights))
+                operations *= 1.5 * (1 + moving)
+                tables = 2 * one.numel() * scene.field.nodes[1] * itemsize * torch.get_num_threads()
+            return Work(operations, 2 * image + 32 * labels.layer_index.numel() + tables)
         kept = 16 * labels.layer_index.numel()
         if _Sums(scene).directly:
             blended = 1 if labels.layer_weight is None else 2
@@ -150,13 +154,22 @@ class _Sums:
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
     """Return the gradients of PSFs and stray light directly; with those of image or depth all by transforms."""
-    light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
+    planes = _occlusion(scene)
+    light, psfs, _, weight, mean, stray_light, _, places = planes
     if any(wants_gradient(x) for x in (light, weight, mean)):
-        return BatchedBackend().gradients(scene, gradient)
+        return (BatchedBackend() if scene.field is None else DenseBackend()).gradients(scene, gradient)
     with torch.no_grad():
-        found = occlusion_direct_gradients(light, psfs, index, weight, mean, stray_light, inside, gradient)
+        found = occlusion_direct_gradients(*planes[:-1], gradient, places)
     pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])
     return [(tensor, own) for tensor, own in pairs if tensor.requires_grad]
+
+
+def _occlusion(scene: LayeredScene) -> tuple[Any, ...]:
+    """Return the arguments of :func:`occlusion_direct`."""
+    light, psfs, weight, mean, stray_light, index, inside = occlusion_planes(scene)
+    if scene.field is None:
+        return light, psfs, index, weight, mean, stray_light, inside, ()
+    return light, psfs.unflatten(0, scene.field.nodes), index, weight, mean, stray_light, inside, scene.places
 
 
 def _fits(scene: LayeredScene, smallest: tuple[int, int]) -> bool:

@@ -18,7 +18,6 @@ from kornia_tidy.render.borders import from_spectrum, to_spectrum
 from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import LayeredScene
 
-OCCLUSION_OVER_FIELD = "occlusion through PSFs that vary over the picture is rendered cell by cell"
 _PLANES = 7  # at a time: three spectra, the blurred layer, the pixels picked so far, twice, and a copy
 
 
@@ -28,8 +27,8 @@ class DenseBackend:
     name = "dense"
 
     def refusal(self, scene: LayeredScene) -> str | None:
-        """Return None: it supports every scene, but for occlusion over a field."""
-        return OCCLUSION_OVER_FIELD if scene.field is not None and scene.compositing == "occlusion" else None
+        """Return None: it supports every scene."""
+        return None
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work for the layers in every eighth row and column of the scene."""
@@ -39,7 +38,8 @@ class DenseBackend:
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64."""
         if scene.compositing == "occlusion":
-            return occlude_dense(*occlusion_planes(scene))
+            shares = None if scene.field is None else scene.places.of_pixels()
+            return occlude_dense(*occlusion_planes(scene), shares)
         index, weight = scene.sorted_layers
         gathers = scene.compositing == "gather"
         composite = gather_dense if gathers else scatter_dense

@@ -109,8 +109,12 @@ def occlude_dense(
     stray_light: Tensor | None,
     layer_index: Tensor,
     inside: Tensor | None,
+    shares: Tensor | None = None,
 ) -> Tensor:
     """Render with occlusion by transforms of the whole plane for every layer, see :func:`lay_over`.
+
+    With PSFs over the field the planes that are divided are those of the PSF of the pixel that sees, and each layer
+    keeps that PSF's light.
 
     Args:
         light: image with its border, see :class:`OcclusionPlanes` for all arguments.
@@ -120,26 +124,39 @@ def occlude_dense(
         stray_light: fraction of the mean that each layer takes on, or None.
         layer_index: of each pixel.
         inside: 1 on the image and 0 in the dark beyond it, or None.
+        shares: (F, H, W) weight of each node of a field, with PSFs (F, D, C, P, P), at each pixel.
 
     Returns:
         (B, C, H, W) float64.
     """
     light, psfs, index = light.double(), psfs.double(), layer_index[:, None]
     weight = None if layer_weight is None else layer_weight[:, None].double()
+    nodes = psfs[None] if shares is None else psfs
     size, side = (light.shape[-2], light.shape[-1]), psfs.shape[-1]
 
-    def blur(plane: Tensor, spectrum: Tensor) -> Tensor:
-        plane = plane if inside is None else plane * inside[:, None]
-        return from_spectrum(to_spectrum(plane, size) * spectrum, size, side)
+    def blended(of_nodes: Iterable[Tensor]) -> Tensor:
+        if shares is None:
+            return next(iter(of_nodes))
+        total = torch.zeros((), dtype=light.dtype, device=light.device)
+        for share, own in zip(shares.to(light), of_nodes, strict=True):
+            total = total + share * own
+        return total
+
+    def blur(plane: Tensor, spectra: list[Tensor]) -> Tensor:
+        own = to_spectrum(plane if inside is None else plane * inside[:, None], size)
+        return blended(from_spectrum(own * spectrum, size, side) for spectrum in spectra)
 
     def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for layer in reversed(present_layers(index, weight, len(psfs))):
-            spectrum = to_spectrum(psfs[layer], size)
+        for layer in reversed(present_layers(index, weight, nodes.shape[1])):
+            spectra = [to_spectrum(psf, size) for psf in nodes[:, layer]]
             own = weight_of_layer(index, weight, layer).double()
             cumulative = cumulative_weight(index, weight, layer).double()
             lit = light
             if mean is not None and stray_light is not None:  # both or none
                 lit = torch.lerp(light, mean.double()[..., None, None], stray_light[layer, :, None, None].double())
-            yield blur(own * lit, spectrum), blur(own, spectrum), blur(cumulative, spectrum)
+            seen = blur(own * lit, spectra)
+            if shares is not None:
+                seen = seen * blended(nodes[:, layer].sum((-2, -1))[..., None, None])
+            yield seen, blur(own, spectra), blur(cumulative, spectra)
 
     return lay_over(near_to_far())
