@@ -53,22 +53,27 @@ INLINE vec *line_at(const lines *l, int64_t slot, int slope) {
     return l->lines + (slot * 2 + slope) * l->f->node_columns * l->vectors;
 }
 
-// Blends the nodes of a plane along their columns, `next` numbers from node to node, if this row has not yet done it.
+// Blends the nodes of a plane along their columns, `next` numbers from node to node, if this row has not yet done it. Nodes
+// come from far memory: each is read once, from its begin to its end, two at a time.
 static void blend_nodes(lines *l, int64_t slot, const REAL *nodes, int64_t next, REAL scale) {
     const field *f = l->f;
     if (l->made[slot]) return;
     l->made[slot] = 1;
-    for (int slope = 0; slope < 1 + has_order(f, l->row, 0, ALONG_Y); slope++) {
-        const REAL *weights = f->row_weights + (2 * l->row + slope) * f->node_rows;
-        vec *line = line_at(l, slot, slope);
-        for (int64_t column = 0; column < f->node_columns; column++, line += l->vectors)
-            for (int64_t n = 0; n < l->vectors; n++) {
-                const REAL *from = nodes + column * next + n * LANES;
-                vec sum = {0};
-                for (int64_t row = 0; row < f->node_rows; row++, from += f->node_columns * next)
-                    sum += weights[row] * scale * load_some(from, l->numbers - n * LANES);
-                line[n] = sum;
+    const int sloped = has_order(f, l->row, 0, ALONG_Y);
+    const REAL *weights = f->row_weights + 2 * l->row * f->node_rows, *slopes = weights + f->node_rows;
+    for (int64_t column = 0; column < f->node_columns; column++) {
+        vec *value = line_at(l, slot, 0) + column * l->vectors, *slope = line_at(l, slot, 1) + column * l->vectors;
+        for (int64_t row = 0; row < f->node_rows; row += 2) {
+            const int two = row + 1 < f->node_rows;
+            const REAL *a = nodes + (row * f->node_columns + column) * next, *b = a + two * f->node_columns * next;
+            const REAL v = weights[row] * scale, u = two ? weights[row + 1] * scale : 0;
+            const REAL s = slopes[row] * scale, t = two ? slopes[row + 1] * scale : 0;
+            for (int64_t n = 0, k = 0; n < l->vectors; n++, k += LANES) {
+                const vec x = load_some(a + k, l->numbers - k), y = load_some(b + k, l->numbers - k);
+                value[n] = v * x + u * y + (row ? value[n] : all(0));
+                if (sloped) slope[n] = s * x + t * y + (row ? slope[n] : all(0));
             }
+        }
     }
 }
 

@@ -11,8 +11,7 @@
 //
 // Layers are given as in scene.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one.
 //
-// PSFs that vary over the field are known at nodes. In a tile they are h0 + x hx + y hy, with x and y from its middle: see
-// below, "PSFs over the field".
+// PSFs may vary over the field, see field.h and below, "tiles".
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
@@ -26,6 +25,7 @@
 #endif
 
 #include "vectors.h"
+#include "field.h"
 
 enum { STAGES = 16 };        // of a transform of up to 2^31 samples by fours
 enum { OUTSIDE = -2 };       // label of a sample that is no pixel of the tile: no layer, nor the one before the first
@@ -49,12 +49,7 @@ typedef struct {
     const REAL *plane;             // (images, channels, height + side - 1, width + side - 1); not for scatter
     const REAL *pixels;            // (images, channels, height, width); not for gather
     REAL *out;                     // gather: as pixels; scatter: as the plane, zeros; gradient: as the PSFs, zeros
-    // Where PSFs are known over the field. Without nodes they are the same everywhere, and tiles are as large as fit.
-    int64_t node_rows, node_columns;           // psfs: (node_rows, node_columns, layers, channels, side, side)
-    int64_t down, across;                      // rows and columns of tiles
-    const int64_t *row_edges, *column_edges;   // (down + 1,), (across + 1,): where tiles begin, and the end
-    const REAL *row_middles, *column_middles;  // (down,), (across,): where slopes begin
-    const REAL *row_weights, *column_weights;  // (down, 2, node_rows), (across, 2, node_columns): of nodes, and slopes
+    field over;                    // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
 } tiles;
 
 // One stage of a transform: `length` samples are cut into `radix` interleaved ones.
@@ -268,22 +263,24 @@ typedef struct {
     vec *light, *label, *weight, *sums;
     wave *spectrum, *total, *half, *row;
     // Over the field only. PSFs are (psf_groups, side) vectors.
-    vec *lines;         // (2, node columns, layers, PSF): at the nodes' columns in a row of tiles, and slopes along it
-    uint8_t *has_line;  // (layers,)
-    int64_t line_row;   // of tiles
-    vec *samples;       // (TERMS, PSF)
+    lines lines;        // of a row of tiles, by layer
+    vec *flat;          // of a tile's PSF, (ORDERS, vectors), and the same in columns of LANES numbers
+    vec *samples;
     wave *moments;      // (2, bands, waves): spectra of light times x and times y
-    wave *psf;          // (TERMS, bands, waves)
+    wave *psf;          // (ORDERS, bands, waves)
 } desk;
 
-// A tile: its image, its number there, its first pixel, and how much of it lies in the image.
+// A tile: its image, its row and column there, its first pixel, how much of it lies in the image, and the orders of its PSF.
 typedef struct {
-    int64_t image, number, top, left, height, width;
+    int64_t image, number, row, column, top, left, height, width;
+    int has[ORDERS];
 } tile;
 
 INLINE tile tile_at(const work *w, int64_t image, int64_t number) {
-    const int64_t *row = w->row_edges + number / w->across, *column = w->column_edges + number % w->across;
-    return (tile){image, number, row[0], column[0], row[1] - row[0], column[1] - column[0]};
+    const int64_t r = number / w->across, c = number % w->across, *row = w->row_edges + r, *column = w->column_edges + c;
+    tile t = {image, number, r, c, row[0], column[0], row[1] - row[0], column[1] - column[0], {1}};
+    for (int order = ALONG_X; w->s->over.node_rows && order < ORDERS; order++) t.has[order] = has_order(&w->s->over, r, c, order);
+    return t;
 }
 
 INLINE uint8_t *needed_by(const work *w, tile t, int64_t layer) {
@@ -298,8 +295,6 @@ static void columns_to_rows(const work *w, int64_t g, wave *column, wave *spectr
     for (int64_t band = 0; band < w->bands; band++)
         transpose(column + band * LANES, spectrum + band * w->waves + g * LANES);
 }
-
-enum { PLAIN, TIMES_X, TIMES_Y };
 
 // The spectrum of the first rows of a plane of numbers, in the first columns; or of the numbers times their distance from
 // a column or a row of the window.
@@ -317,8 +312,8 @@ INLINE void analyse_times(const work *w, const vec *light, int64_t pitch, int64_
         const int both = g + w->groups < groups;
         for (int64_t y = 0; y < height; y++) {
             vec a = left[y], b = both ? right[y] : (vec){0};
-            if (what == TIMES_X) a *= x, b *= z;
-            if (what == TIMES_Y) a *= y - middle, b *= y - middle;
+            if (what == ALONG_X) a *= x, b *= z;
+            if (what == ALONG_Y) a *= y - middle, b *= y - middle;
             column[y] = (wave){a * turn.re - b * turn.im, a * turn.im + b * turn.re};
         }
         memset(column + height, 0, (w->s->rows - height) * sizeof(wave));
@@ -329,16 +324,24 @@ INLINE void analyse_times(const work *w, const vec *light, int64_t pitch, int64_
 
 // The spectrum of a plane of numbers.
 static void analyse(const work *w, const vec *light, wave *column, wave *spectrum) {
-    analyse_times(w, light, w->s->rows, w->s->rows, 2 * w->groups, PLAIN, 0, column, spectrum);
+    analyse_times(w, light, w->s->rows, w->s->rows, 2 * w->groups, VALUE, 0, column, spectrum);
 }
 
-// Multiplies by the spectrum of a PSF, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
-INLINE void multiply(const wave *x, const wave *psf, int64_t count, REAL sign, int add, wave *product) {
+// Multiplies by a spectrum, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
+INLINE void multiply_by(const wave *x, const wave *psf, int64_t count, REAL sign, int add, wave *product) {
     for (int64_t k = 0; k < count; k++) {
         vec im = sign * psf[k].im;
         wave z = {x[k].re * psf[k].re - x[k].im * im, x[k].re * im + x[k].im * psf[k].re};
         product[k] = add ? sum(product[k], z) : z;
     }
+}
+
+// Multiplies by the spectrum of a PSF as above.
+INLINE void multiply(const tiles *s, const wave *x, const wave *psf, int64_t count, int add, wave *product) {
+    if (s->correlate && add) multiply_by(x, psf, count, -1, 1, product);
+    else if (s->correlate) multiply_by(x, psf, count, -1, 0, product);
+    else if (add) multiply_by(x, psf, count, 1, 1, product);
+    else multiply_by(x, psf, count, 1, 0, product);
 }
 
 // Transforms a row of waves back and hands it on to the columns that are needed.
@@ -441,32 +444,6 @@ static void write_sums(const work *w, tile t, int64_t channel, const desk *d) {
         }
 }
 
-static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
-    const tiles *s = w->s;
-    const int64_t rows = s->rows;
-    cut_window(w, t, channel, d->light);
-    analyse(w, d->light, d->half, d->spectrum);
-    read_labels(w, t, d);
-    memset(d->sums, 0, 2 * w->groups * rows * sizeof(vec));
-    for (int64_t layer = 0; layer < s->layers; layer++) {
-        const uint8_t *needed = needed_by(w, t, layer);
-        if (!any_of(needed, w->groups)) continue;
-        const wave *psf = w->psfs + w->place[layer] * w->bands * w->waves;
-        for (int64_t band = 0; band < w->bands; band++) {
-            const wave *x = d->spectrum + band * w->waves, *y = psf + band * w->waves;
-            if (s->correlate) multiply(x, y, w->waves, -1, 0, d->row);
-            else multiply(x, y, w->waves, 1, 0, d->row);
-            row_back(w, d->row, band, needed, d->half);
-        }
-        for (int64_t g = 0; g < w->groups; g++)
-            if (needed[g]) {
-                backward(d->half + g * rows, &w->in_columns);
-                add_shares(w, t, layer, g, d->half + g * rows, d);
-            }
-    }
-    write_sums(w, t, channel, d);
-}
-
 // The transformed columns of a layer's share of the pixels, which lie in `sums`. Its rows are left to be transformed.
 static void layer_columns(const work *w, tile t, int64_t layer, desk *d) {
     const tiles *s = w->s;
@@ -514,189 +491,87 @@ INLINE void add_columns(const work *w, int64_t g, const wave *column, const wave
     }
 }
 
-static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
-    const tiles *s = w->s;
-    const int64_t all = w->bands * w->waves;
-    cut_tile(w, t, channel, d->sums);
-    read_labels(w, t, d);
-    memset(d->total, 0, all * sizeof(wave));
-    for (int64_t layer = 0; layer < s->layers; layer++) {
-        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
-        layer_columns(w, t, layer, d);
-        const wave *psf = w->psfs + w->place[layer] * all;
-        for (int64_t k = 0; k < all; k += w->waves) {
-            wave *row = d->spectrum + k;
-            forward(row, &w->in_rows);
-            if (s->correlate) multiply(row, psf + k, w->waves, -1, 1, d->total + k);
-            else multiply(row, psf + k, w->waves, 1, 1, d->total + k);
-        }
-    }
-    for (int64_t band = 0; band < w->bands; band++) row_back(w, d->total + band * w->waves, band, 0, d->half);
-    const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
-    REAL *out = s->out + ((t.image * s->channels + channel) * height + t.top) * width + t.left;
-    for (int64_t g = 0; g < w->groups; g++) {
-        backward(d->half + g * s->rows, &w->in_columns);
-        add_columns(w, g, d->half + g * s->rows, 0, 0, t.height + s->side - 1, t.width + s->side - 1, out, width);
-    }
-}
-
-// Adds the spectra of a tile's correlations to those of a slab.
-static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave *slab) {
-    const tiles *s = w->s;
-    const int64_t all = w->bands * w->waves;
-    cut_window(w, t, channel, d->light);
-    analyse(w, d->light, d->half, d->total);
-    cut_tile(w, t, channel, d->sums);
-    read_labels(w, t, d);
-    for (int64_t layer = 0; layer < s->layers; layer++) {
-        if (!any_of(needed_by(w, t, layer), w->groups)) continue;
-        layer_columns(w, t, layer, d);
-        wave *found = slab + w->place[layer] * all;
-        for (int64_t k = 0; k < all; k += w->waves) {
-            wave *row = d->spectrum + k;
-            forward(row, &w->in_rows);
-            if (s->correlate) multiply(d->total + k, row, w->waves, -1, 1, found + k);
-            else multiply(row, d->total + k, w->waves, -1, 1, found + k);
-        }
-    }
-}
-
-// ---------------------------------------------------------------------- PSFs over the field
+// ---------------------------------------------------------------------- tiles
 //
-// The PSF of a pixel is h0 + x hx + y hy, with its distance x, y from the middle of its tile. What stands before the sum
-// of gather, x (L * hx) = (xL) * hx + L * (k hx) with a PSF's own coordinate k, leaves one transform back for each layer:
+// Over the field what stands before the sum of gather, x (L * hx) = (xL) * hx + L * (k hx) with a PSF's own coordinate k,
+// leaves one transform back for each layer:
 //
 //     L * (h0 + k_x hx + k_y hy) + (xL) * hx + (yL) * hy
 //
-// Scatter is its transpose: x and y follow the sum over the layers of a tile. Nodes are blended along their columns once
-// for each row of tiles, then along this row for each tile.
-
-enum { TERMS = 3 };  // h0 + k_x hx + k_y hy, hx and hy
+// Scatter is its transpose: x and y follow the sum over the layers of a tile.
 
 INLINE int64_t psf_groups(const tiles *s) { return (s->side + LANES - 1) / LANES; }
-INLINE int64_t psf_vectors(const tiles *s) { return psf_groups(s) * s->side; }
-
-INLINE const REAL *row_weights(const work *w, tile t) { return w->s->row_weights + t.number / w->across * 2 * w->s->node_rows; }
-INLINE const REAL *column_weights(const work *w, tile t) {
-    return w->s->column_weights + t.number % w->across * 2 * w->s->node_columns;
-}
-
-INLINE int any(const REAL *numbers, int64_t count) {
-    for (int64_t n = 0; n < count; n++)
-        if (numbers[n] != 0) return 1;
-    return 0;
-}
-
-// Which terms a tile has: bits 1 << PLAIN, 1 << TIMES_X and 1 << TIMES_Y.
-static int terms_of(const work *w, tile t) {
-    const tiles *s = w->s;
-    return 1 << PLAIN | any(column_weights(w, t) + s->node_columns, s->node_columns) << TIMES_X |
-           any(row_weights(w, t) + s->node_rows, s->node_rows) << TIMES_Y;
-}
-
-INLINE int has(int terms, int term) { return terms >> term & 1; }
 
 // Row or column of the window from which x or y is counted.
-INLINE REAL middle_of(const work *w, tile t, int what) {
-    const tiles *s = w->s;
-    const REAL middle = what == TIMES_X ? s->column_middles[t.number % w->across] - t.left
-                                        : s->row_middles[t.number / w->across] - t.top;
-    return middle + s->side / 2;
-}
-
-INLINE vec *line_at(const work *w, desk *d, int slope, int64_t column, int64_t layer) {
-    return d->lines + ((slope * w->s->node_columns + column) * w->s->layers + layer) * psf_vectors(w->s);
-}
-
-static void begin_row(const work *w, desk *d, int64_t row) {
-    if (d->line_row == row) return;
-    d->line_row = row;
-    memset(d->has_line, 0, w->s->layers);
-}
-
-// Blends the nodes along their columns for a row of tiles, scaled for a transform there and back.
-static void blend_rows(const work *w, tile t, int64_t channel, int64_t layer, int terms, desk *d) {
-    const tiles *s = w->s;
-    const REAL *weights = row_weights(w, t);
-    const int64_t next = s->node_columns * s->layers * s->channels * s->side * s->side;
-    if (d->has_line[layer]) return;
-    d->has_line[layer] = 1;
-    for (int64_t column = 0; column < s->node_columns; column++)
-        for (int slope = 0; slope < has(terms, TIMES_Y) + 1; slope++) {
-            vec *line = line_at(w, d, slope, column, layer);
-            const REAL *psf = s->psfs + ((column * s->layers + layer) * s->channels + channel) * s->side * s->side;
-            for (int64_t g = 0; g < psf_groups(s); g++)
-                for (int64_t y = 0; y < s->side; y++) {
-                    const REAL *from = psf + y * s->side + g * LANES;
-                    const int64_t count = least(LANES, s->side - g * LANES);
-                    vec sum = {0};
-                    for (int64_t n = 0; n < s->node_rows; n++) {
-                        vec x = {0};
-                        if (count == LANES) memcpy(&x, from + n * next, sizeof x);
-                        else memcpy(&x, from + n * next, count * sizeof(REAL));
-                        sum += weights[slope * s->node_rows + n] * w->scale * x;
-                    }
-                    line[g * s->side + y] = sum;
-                }
-        }
+INLINE REAL middle_of(const work *w, tile t, int order) {
+    const field *f = &w->s->over;
+    const REAL middle = order == ALONG_X ? f->column_middles[t.column] - t.left
+                                         : f->row_middles[t.row] - t.top;
+    return middle + w->s->side / 2;
 }
 
 // The sign of k: PSFs are convolved with the light, or correlated.
 INLINE REAL direction(const tiles *s) { return s->origin ? 1 : -1; }
 
-// Makes the spectra of a layer's PSF in a tile, one for each term.
-static void tile_psfs(const work *w, tile t, int64_t channel, int64_t layer, int terms, desk *d) {
+// PSFs of a layer and channel at the nodes, and how many numbers later the next node's are.
+INLINE const REAL *nodes_of(const tiles *s, int64_t layer, int64_t channel) {
+    return s->psfs + (layer * s->channels + channel) * s->side * s->side;
+}
+INLINE int64_t next_node(const tiles *s) { return s->layers * s->channels * s->side * s->side; }
+
+// Returns the spectra of a layer's PSF in a tile, one for each order.
+static const wave *tile_psfs(const work *w, tile t, int64_t channel, int64_t layer, desk *d) {
     const tiles *s = w->s;
-    const int64_t count = psf_vectors(s), all = w->bands * w->waves, columns = s->node_columns;
-    const int64_t next = line_at(w, d, 0, 1, 0) - line_at(w, d, 0, 0, 0);
-    const REAL *weights = column_weights(w, t), *x_weights = weights + columns, radius = s->side / 2;
-    blend_rows(w, t, channel, layer, terms, d);
-    const vec *line = line_at(w, d, 0, 0, layer), *slope = line_at(w, d, 1, 0, layer);
-    for (int64_t g = 0, n = 0; g < psf_groups(s); g++)
+    const int64_t all = w->bands * w->waves, groups = psf_groups(s), count = groups * s->side;
+    if (!s->over.node_rows) return w->psfs + w->place[layer] * all;
+    const int along_x = t.has[ALONG_X], along_y = t.has[ALONG_Y];
+    const REAL radius = s->side / 2;
+    blend_nodes(&d->lines, layer, nodes_of(s, layer, channel), next_node(s), w->scale);
+    blend_line(&d->lines, layer, t.column, d->flat);
+    for (int64_t g = 0, n = 0; g < groups; g++) {
+        const bits inside = steps() < (REAL)(s->side - g * LANES);
+        const vec k = direction(s) * (steps() + (g * LANES - radius));
         for (int64_t y = 0; y < s->side; y++, n++) {
-            vec h = {0}, x = {0}, v = {0};
-            for (int64_t c = 0; c < columns; c++) {
-                h += weights[c] * line[c * next + n];
-                if (has(terms, TIMES_X)) x += x_weights[c] * line[c * next + n];
-                if (has(terms, TIMES_Y)) v += weights[c] * slope[c * next + n];
-            }
-            d->samples[n] = h + direction(s) * ((steps() + (g * LANES - radius)) * x + (y - radius) * v);
-            d->samples[TIMES_X * count + n] = x, d->samples[TIMES_Y * count + n] = v;
+            vec psf[ORDERS];
+            for (int order = 0; order < ORDERS; order++)
+                psf[order] = where(inside, *(const loose *)((REAL *)(d->flat + order * d->lines.vectors) + y * s->side + g * LANES));
+            d->samples[n] = psf[VALUE] + k * psf[ALONG_X] + direction(s) * (y - radius) * psf[ALONG_Y];
+            if (along_x) d->samples[count + n] = psf[ALONG_X];
+            if (along_y) d->samples[2 * count + n] = psf[ALONG_Y];
         }
-    for (int term = 0; term < TERMS; term++)
-        if (has(terms, term))
-            analyse_times(w, d->samples + term * count, s->side, s->side, psf_groups(s), PLAIN, 0, d->half, d->psf + term * all);
+    }
+    for (int order = 0; order < ORDERS; order++)
+        if (t.has[order])
+            analyse_times(w, d->samples + order * count, s->side, s->side, groups, VALUE, 0, d->half, d->psf + order * all);
+    return d->psf;
 }
 
 // Makes the spectra of a plane of light, and of the light times x and times y.
-static void analyse_moments(const work *w, tile t, int terms, desk *d, wave *spectrum) {
+static void analyse_moments(const work *w, tile t, desk *d, wave *spectrum) {
     const int64_t rows = w->s->rows, all = w->bands * w->waves;
     analyse(w, d->light, d->half, spectrum);
-    if (has(terms, TIMES_X))
-        analyse_times(w, d->light, rows, rows, 2 * w->groups, TIMES_X, middle_of(w, t, TIMES_X), d->half, d->moments);
-    if (has(terms, TIMES_Y))
-        analyse_times(w, d->light, rows, rows, 2 * w->groups, TIMES_Y, middle_of(w, t, TIMES_Y), d->half, d->moments + all);
+    if (t.has[ALONG_X])
+        analyse_times(w, d->light, rows, rows, 2 * w->groups, ALONG_X, middle_of(w, t, ALONG_X), d->half, d->moments);
+    if (t.has[ALONG_Y])
+        analyse_times(w, d->light, rows, rows, 2 * w->groups, ALONG_Y, middle_of(w, t, ALONG_Y), d->half, d->moments + all);
 }
 
-static void gather_over_field(const work *w, int64_t channel, tile t, desk *d) {
+static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
     const tiles *s = w->s;
     const int64_t rows = s->rows, all = w->bands * w->waves;
-    const int terms = terms_of(w, t);
-    const REAL sign = s->correlate ? -1 : 1;
+    const wave *light[ORDERS] = {d->spectrum, d->moments, d->moments + all};
     cut_window(w, t, channel, d->light);
-    analyse_moments(w, t, terms, d, d->spectrum);
+    analyse_moments(w, t, d, d->spectrum);
     read_labels(w, t, d);
     memset(d->sums, 0, 2 * w->groups * rows * sizeof(vec));
     for (int64_t layer = 0; layer < s->layers; layer++) {
         const uint8_t *needed = needed_by(w, t, layer);
         if (!any_of(needed, w->groups)) continue;
-        tile_psfs(w, t, channel, layer, terms, d);
+        const wave *psf = tile_psfs(w, t, channel, layer, d);
         for (int64_t band = 0; band < w->bands; band++) {
             const int64_t k = band * w->waves;
-            multiply(d->spectrum + k, d->psf + k, w->waves, sign, 0, d->row);
-            for (int term = TIMES_X; term < TERMS; term++)
-                if (has(terms, term))
-                    multiply(d->moments + (term - 1) * all + k, d->psf + term * all + k, w->waves, sign, 1, d->row);
+            for (int order = 0; order < ORDERS; order++)
+                if (t.has[order]) multiply(s, light[order] + k, psf + order * all + k, w->waves, order, d->row);
             row_back(w, d->row, band, needed, d->half);
         }
         for (int64_t g = 0; g < w->groups; g++)
@@ -708,109 +583,101 @@ static void gather_over_field(const work *w, int64_t channel, tile t, desk *d) {
     write_sums(w, t, channel, d);
 }
 
-static void scatter_over_field(const work *w, int64_t channel, tile t, desk *d) {
+static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
     const tiles *s = w->s;
     const int64_t all = w->bands * w->waves, half = w->groups * s->rows;
-    const int terms = terms_of(w, t);
-    const REAL sign = s->correlate ? -1 : 1;
-    wave *totals[TERMS] = {d->total, d->moments, d->moments + all};
+    wave *totals[ORDERS] = {d->total, d->moments, d->moments + all};
     cut_tile(w, t, channel, d->sums);
     read_labels(w, t, d);
-    for (int term = 0; term < TERMS; term++)
-        if (has(terms, term)) memset(totals[term], 0, all * sizeof(wave));
+    for (int order = 0; order < ORDERS; order++)
+        if (t.has[order]) memset(totals[order], 0, all * sizeof(wave));
     for (int64_t layer = 0; layer < s->layers; layer++) {
         if (!any_of(needed_by(w, t, layer), w->groups)) continue;
-        tile_psfs(w, t, channel, layer, terms, d);
+        const wave *psf = tile_psfs(w, t, channel, layer, d);
         layer_columns(w, t, layer, d);
         for (int64_t k = 0; k < all; k += w->waves) {
             forward(d->spectrum + k, &w->in_rows);
-            for (int term = 0; term < TERMS; term++)
-                if (has(terms, term))
-                    multiply(d->spectrum + k, d->psf + term * all + k, w->waves, sign, 1, totals[term] + k);
+            for (int order = 0; order < ORDERS; order++)
+                if (t.has[order]) multiply(s, d->spectrum + k, psf + order * all + k, w->waves, 1, totals[order] + k);
         }
     }
     const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
     REAL *out = s->out + ((t.image * s->channels + channel) * height + t.top) * width + t.left;
-    for (int term = 0; term < TERMS; term++)
-        for (int64_t band = 0; has(terms, term) && band < w->bands; band++)
-            row_back(w, totals[term] + band * w->waves, band, 0, d->half + term * half);
+    for (int order = 0; order < ORDERS; order++)
+        for (int64_t band = 0; t.has[order] && band < w->bands; band++)
+            row_back(w, totals[order] + band * w->waves, band, 0, d->half + order * half);
+    const REAL x_middle = t.has[ALONG_X] ? middle_of(w, t, ALONG_X) : 0;
     for (int64_t g = 0; g < w->groups; g++) {
-        wave *columns[TERMS] = {0};
-        for (int term = 0; term < TERMS; term++)
-            if (has(terms, term)) backward(columns[term] = d->half + term * half + g * s->rows, &w->in_columns);
-        const REAL middle = middle_of(w, t, TIMES_Y);
-        for (int64_t y = 0; columns[TIMES_Y] && y < t.height + s->side - 1; y++) {
-            const wave x = columns[TIMES_Y][y];
-            columns[0][y] = sum(columns[0][y], (wave){x.re * (y - middle), x.im * (y - middle)});
+        wave *columns[ORDERS] = {0};
+        for (int order = 0; order < ORDERS; order++)
+            if (t.has[order]) backward(columns[order] = d->half + order * half + g * s->rows, &w->in_columns);
+        for (int64_t y = 0; columns[ALONG_Y] && y < t.height + s->side - 1; y++) {
+            const wave x = columns[ALONG_Y][y];
+            const REAL from = y - middle_of(w, t, ALONG_Y);
+            columns[0][y] = sum(columns[0][y], (wave){x.re * from, x.im * from});
         }
-        add_columns(w, g, columns[0], columns[TIMES_X], middle_of(w, t, TIMES_X), t.height + s->side - 1,
-                    t.width + s->side - 1, out, width);
+        add_columns(w, g, columns[0], columns[ALONG_X], x_middle, t.height + s->side - 1, t.width + s->side - 1, out, width);
     }
 }
 
-// Adds the gradient of a layer's PSF in a tile to those of the lines.
-static void correlate_over_field(const work *w, int64_t channel, tile t, desk *d) {
+// Adds the gradient of a layer's PSF in a tile to that of its row of tiles, from their spectra.
+static void add_to_line(const work *w, tile t, int64_t layer, desk *d) {
     const tiles *s = w->s;
-    const int64_t all = w->bands * w->waves, half = w->groups * s->rows, count = psf_vectors(s);
-    const REAL *weights = column_weights(w, t), *x_weights = weights + s->node_columns, radius = s->side / 2;
-    const int terms = terms_of(w, t);
-    const wave *light[TERMS] = {d->total, d->moments, d->moments + all};
+    const int64_t all = w->bands * w->waves, groups = psf_groups(s), count = groups * s->side, vectors = d->lines.vectors;
+    const REAL radius = s->side / 2;
+    for (int order = 0; order < ORDERS; order++) {
+        vec *samples = d->samples + order * count;
+        memset(samples, 0, count * sizeof(vec));
+        if (!t.has[order]) continue;
+        for (int64_t band = 0; band < w->bands; band++) row_back(w, d->psf + order * all + band * w->waves, band, 0, d->half);
+        for (int64_t g = 0; g < w->groups && g < groups; g++) {
+            wave *column = d->half + g * s->rows;
+            backward(column, &w->in_columns);
+            for (int side = 0; side < 2; side++) {
+                const int64_t own = g + side * w->groups;
+                for (int64_t y = 0; own < groups && y < s->side; y++)
+                    samples[own * s->side + y] = unturned(column[y], w->turns[g], side);
+            }
+        }
+    }
+    for (int64_t g = 0, n = 0; g < groups; g++)
+        for (int64_t y = 0; y < s->side; y++, n++) {
+            const vec h = d->samples[n], k = direction(s) * (steps() + (g * LANES - radius));
+            const vec psf[ORDERS] = {h, d->samples[count + n] + k * h, d->samples[2 * count + n] + direction(s) * (y - radius) * h};
+            for (int order = 0; order < ORDERS; order++) {
+                REAL *to = (REAL *)(d->flat + order * vectors) + y * s->side + g * LANES;
+                memcpy(to, psf + order, least(LANES, s->side - g * LANES) * sizeof(REAL));
+            }
+        }
+    spread_tile(&d->lines, layer, t.column, d->flat);
+}
+
+// Correlates a tile with its light: adds spectra to those of a slab or, over the field, PSFs to those of a row of tiles.
+static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave *slab) {
+    const tiles *s = w->s;
+    const int64_t all = w->bands * w->waves;
+    const int over_field = s->over.node_rows > 0;
+    const wave *light[ORDERS] = {d->total, d->moments, d->moments + all};
     cut_window(w, t, channel, d->light);
-    analyse_moments(w, t, terms, d, d->total);
+    analyse_moments(w, t, d, d->total);
     cut_tile(w, t, channel, d->sums);
     read_labels(w, t, d);
     for (int64_t layer = 0; layer < s->layers; layer++) {
         if (!any_of(needed_by(w, t, layer), w->groups)) continue;
         layer_columns(w, t, layer, d);
-        for (int64_t band = 0; band < w->bands; band++) {
-            wave *row = d->spectrum + band * w->waves;
+        wave *found = over_field ? d->psf : slab + w->place[layer] * all;
+        for (int64_t k = 0; k < all; k += w->waves) {
+            wave *row = d->spectrum + k;
             forward(row, &w->in_rows);
-            for (int term = 0; term < TERMS; term++) {
-                if (!has(terms, term)) continue;
-                const wave *x = light[term] + band * w->waves;
-                if (s->correlate) multiply(x, row, w->waves, -1, 0, d->row);
-                else multiply(row, x, w->waves, -1, 0, d->row);
-                row_back(w, d->row, band, 0, d->half + term * half);
+            for (int order = 0; order < ORDERS; order++) {
+                if (!t.has[order]) continue;
+                const wave *x = light[order] + k;
+                if (s->correlate) multiply_by(x, row, w->waves, -1, !over_field, found + order * all + k);
+                else multiply_by(row, x, w->waves, -1, !over_field, found + order * all + k);
             }
         }
-        memset(d->samples, 0, TERMS * count * sizeof(vec));
-        for (int term = 0; term < TERMS; term++)
-            for (int64_t g = 0; has(terms, term) && g < w->groups; g++) {
-                wave *column = d->half + term * half + g * s->rows;
-                if (g >= psf_groups(s)) break;
-                backward(column, &w->in_columns);
-                for (int side = 0; side < 2; side++) {
-                    const int64_t own = g + side * w->groups;
-                    for (int64_t y = 0; own < psf_groups(s) && y < s->side; y++)
-                        d->samples[term * count + own * s->side + y] = unturned(column[y], w->turns[g], side);
-                }
-            }
-        for (int64_t c = 0; c < s->node_columns; c++) {
-            vec *line = line_at(w, d, 0, c, layer), *slope = line_at(w, d, 1, c, layer);
-            if (!d->has_line[layer]) memset(line, 0, count * sizeof(vec)), memset(slope, 0, count * sizeof(vec));
-            for (int64_t g = 0, n = 0; g < psf_groups(s); g++)
-                for (int64_t y = 0; y < s->side; y++, n++) {
-                    const vec h = d->samples[n], k = direction(s) * (steps() + (g * LANES - radius));
-                    line[n] += weights[c] * h + x_weights[c] * (d->samples[TIMES_X * count + n] + k * h);
-                    slope[n] += weights[c] * (d->samples[TIMES_Y * count + n] + direction(s) * (y - radius) * h);
-                }
-        }
-        d->has_line[layer] = 1;
+        if (over_field) add_to_line(w, t, layer, d);
     }
-}
-
-// Adds the gradients of a row of tiles to those of the nodes, (node_rows, node_columns, layers, PSF) vectors.
-static void add_lines(const work *w, int64_t row, desk *d, vec *nodes) {
-    const tiles *s = w->s;
-    const int64_t count = psf_vectors(s);
-    const REAL *weights = s->row_weights + row * 2 * s->node_rows;
-    for (int64_t layer = 0; layer < s->layers; layer++)
-        for (int64_t n = 0; d->has_line[layer] && n < s->node_rows * s->node_columns; n++) {
-            const REAL value = weights[n / s->node_columns], slope = weights[s->node_rows + n / s->node_columns];
-            const vec *line = line_at(w, d, 0, n % s->node_columns, layer), *sloped = line_at(w, d, 1, n % s->node_columns, layer);
-            vec *node = nodes + (n * s->layers + layer) * count;
-            for (int64_t k = 0; k < count; k++) node[k] += value * line[k] + slope * sloped[k];
-        }
 }
 
 // ---------------------------------------------------------------------- a call
@@ -876,21 +743,28 @@ static int64_t apart(const int64_t *edges, int64_t count, int64_t side) {
     return tiles;
 }
 
-// Gathers or scatters all tiles of a channel. Tiles whose windows overlap are not scattered at the same time, so that
-// the order of additions is always the same.
+// Gathers or scatters all tiles of a channel; over the field a thread takes a row of tiles. Tiles whose windows overlap are
+// not scattered at the same time, so that the order of additions is always the same.
 static void render_tiles(const work *w, int64_t channel, desk *desks, int kind) {
     const tiles *s = w->s;
+    const int over_field = s->over.node_rows > 0;
     const int64_t down = kind == SCATTER ? apart(w->row_edges, w->down, s->side) : 1;
-    const int64_t across = kind == SCATTER ? apart(w->column_edges, w->across, s->side) : 1;
+    const int64_t across = kind == SCATTER && !over_field ? apart(w->column_edges, w->across, s->side) : 1;
+    for (int64_t n = 0; n < s->threads; n++) desks[n].lines.row = -1;
     for (int64_t phase = 0; phase < least(down, w->down) * across; phase++) {
         const int64_t y = phase / across, x = phase % across;
         const int64_t own = (w->down - y + down - 1) / down, beside = (w->across - x + across - 1) / across;
+        const int64_t together = over_field ? beside : 1;
 #pragma omp parallel for schedule(dynamic) num_threads(s->threads)
-        for (int64_t n = 0; n < s->images * own * beside; n++) {
-            const int64_t row = n / beside % own * down + y, column = n % beside * across + x;
-            const tile t = tile_at(w, n / (own * beside), row * w->across + column);
-            if (kind == SCATTER) scatter_tile(w, channel, t, desks + thread_number());
-            else gather_tile(w, channel, t, desks + thread_number());
+        for (int64_t n = 0; n < s->images * own * beside / together; n++) {
+            desk *d = desks + thread_number();
+            for (int64_t m = n * together; m < (n + 1) * together; m++) {
+                const int64_t row = m / beside / s->images * down + y, column = m % beside * across + x;
+                const tile t = tile_at(w, m / beside % s->images, row * w->across + column);
+                if (over_field) begin_row(&d->lines, row);
+                if (kind == SCATTER) scatter_tile(w, channel, t, d);
+                else gather_tile(w, channel, t, d);
+            }
         }
     }
 }
@@ -923,56 +797,31 @@ static void correlate_tiles(const work *w, int64_t channel, desk *desks, int64_t
     }
 }
 
-// Gathers or scatters all tiles of a channel over the field, a row of tiles in one thread. Rows whose windows overlap are
-// not scattered at the same time.
-static void render_over_field(const work *w, int64_t channel, desk *desks, int kind) {
-    const tiles *s = w->s;
-    const int64_t down = kind == SCATTER ? apart(w->row_edges, w->down, s->side) : 1;
-    for (int64_t n = 0; n < s->threads; n++) desks[n].line_row = -1;
-    for (int64_t phase = 0; phase < least(down, w->down); phase++) {
-        const int64_t own = (w->down - phase + down - 1) / down;
-#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
-        for (int64_t n = 0; n < s->images * own; n++) {
-            const int64_t row = n / s->images * down + phase;
-            desk *d = desks + thread_number();
-            begin_row(w, d, row);
-            for (int64_t column = 0; column < w->across; column++) {
-                const tile t = tile_at(w, n % s->images, row * w->across + column);
-                if (kind == SCATTER) scatter_over_field(w, channel, t, d);
-                else gather_over_field(w, channel, t, d);
-            }
-        }
-    }
-}
-
 // Correlates all rows of tiles of a channel over the field, a slab of them in each thread; then the slabs are added.
 static void correlate_rows(const work *w, int64_t channel, desk *desks) {
     const tiles *s = w->s;
-    const int64_t nodes = s->node_rows * s->node_columns * s->layers, count = psf_vectors(s);
+    const int64_t nodes = s->over.node_rows * s->over.node_columns, count = desks->lines.vectors, all = nodes * s->layers * count;
     vec *slabs = (vec *)w->psfs;
-    memset(slabs, 0, s->threads * nodes * count * sizeof(vec));
+    memset(slabs, 0, s->threads * all * sizeof(vec));
 #pragma omp parallel for schedule(dynamic) num_threads(s->threads)
     for (int64_t slab = 0; slab < s->threads; slab++) {
         desk *d = desks + thread_number();
         for (int64_t row = w->down * slab / s->threads; row < w->down * (slab + 1) / s->threads; row++) {
-            d->line_row = -1;
-            begin_row(w, d, row);
+            d->lines.row = -1;
+            begin_row(&d->lines, row);
             for (int64_t n = 0; n < s->images * w->across; n++)
-                correlate_over_field(w, channel, tile_at(w, n / w->across, row * w->across + n % w->across), d);
-            add_lines(w, row, d, slabs + slab * nodes * count);
+                correlate_tile(w, channel, tile_at(w, n / w->across, row * w->across + n % w->across), d, 0);
+            for (int64_t layer = 0; layer < s->layers; layer++)
+                spread_line(&d->lines, layer, slabs + slab * all + layer * count, s->layers * count);
         }
     }
 #pragma omp parallel for num_threads(s->threads)
-    for (int64_t n = 0; n < nodes; n++) {
-        vec *found = slabs + n * count;
+    for (int64_t n = 0; n < nodes * s->layers; n++) {
         REAL *out = s->out + (n * s->channels + channel) * s->side * s->side;
-        for (int64_t slab = 1; slab < s->threads; slab++)
-            for (int64_t k = 0; k < count; k++) found[k] += found[slab * nodes * count + k];
-        for (int64_t g = 0; g < psf_groups(s); g++)
-            for (int64_t y = 0; y < s->side; y++) {
-                const vec x = found[g * s->side + y] * w->scale;
-                memcpy(out + y * s->side + g * LANES, &x, least(LANES, s->side - g * LANES) * sizeof(REAL));
-            }
+        for (int64_t slab = 0; slab < s->threads; slab++) {
+            const REAL *found = (const REAL *)(slabs + slab * all + n * count);
+            for (int64_t k = 0; k < s->side * s->side; k++) out[k] += found[k] * w->scale;
+        }
     }
 }
 
@@ -995,16 +844,17 @@ static int take_desk(const work *w, desk *d) {
     d->sums = take(plane, sizeof(vec));
     d->spectrum = take(waves, sizeof(wave));
     d->total = take(waves, sizeof(wave));
-    d->half = take((w->s->node_rows ? TERMS : 1) * w->groups * w->s->rows, sizeof(wave));
+    const int over_field = w->s->over.node_rows > 0, orders = over_field ? ORDERS : 1;
+    d->half = take(orders * w->groups * w->s->rows, sizeof(wave));
     d->row = take(w->waves, sizeof(wave));
-    const int taken = d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
-    if (!w->s->node_rows) return taken;
-    d->lines = take(2 * w->s->node_columns * w->s->layers * psf_vectors(w->s), sizeof(vec));
-    d->has_line = take(w->s->layers, 1);
-    d->samples = take(TERMS * psf_vectors(w->s), sizeof(vec));
+    int taken = d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
+    taken &= take_lines(&w->s->over, w->s->layers, w->s->side * w->s->side, &d->lines);
+    if (!over_field) return taken;
+    d->flat = take(ORDERS * d->lines.vectors + psf_groups(w->s), sizeof(vec));  // the last row is read beyond its end
+    d->samples = take(ORDERS * psf_groups(w->s) * w->s->side, sizeof(vec));
     d->moments = take(2 * waves, sizeof(wave));
-    d->psf = take(TERMS * waves, sizeof(wave));
-    return taken && d->lines && d->has_line && d->samples && d->moments && d->psf;
+    d->psf = take(ORDERS * waves, sizeof(wave));
+    return taken && d->flat && d->samples && d->moments && d->psf;
 }
 
 static void free_desk(desk *d) {
@@ -1016,8 +866,8 @@ static void free_desk(desk *d) {
     free(d->total);
     free(d->half);
     free(d->row);
-    free(d->lines);
-    free(d->has_line);
+    free_lines(&d->lines);
+    free(d->flat);
     free(d->samples);
     free(d->moments);
     free(d->psf);
@@ -1033,15 +883,15 @@ static int compute_in(work *w, desk *desks, int kind) {
         w->turns[j / LANES].im[j % LANES] = sin(M_PI * (double)j / (double)s->columns);
     }
     const int64_t present = place_layers(w), slabs = kind == CORRELATE ? s->threads : 1;
-    if (!s->node_rows) w->psfs = take(slabs * present * w->bands * w->waves, sizeof(wave));
-    else w->psfs = take(kind == CORRELATE ? slabs * s->node_rows * s->node_columns * s->layers * psf_vectors(s) : 0, sizeof(vec));
+    const field *f = &s->over;
+    if (!f->node_rows) w->psfs = take(slabs * present * w->bands * w->waves, sizeof(wave));
+    else w->psfs = take(kind == CORRELATE ? slabs * f->node_rows * f->node_columns * s->layers * desks->lines.vectors : 0, sizeof(vec));
     if (!w->psfs) return 2;
     for (int64_t channel = 0; channel < s->channels; channel++) {
-        if (s->node_rows && kind == CORRELATE) correlate_rows(w, channel, desks);
-        else if (s->node_rows) render_over_field(w, channel, desks, kind);
+        if (kind == CORRELATE && f->node_rows) correlate_rows(w, channel, desks);
         else if (kind == CORRELATE) correlate_tiles(w, channel, desks, present);
         else {
-            transform_psfs(w, channel, desks);
+            if (!f->node_rows) transform_psfs(w, channel, desks);
             render_tiles(w, channel, desks, kind);
         }
     }
@@ -1058,10 +908,10 @@ static int64_t *even_edges(int64_t pixels, int64_t side, int64_t count) {
 
 static int compute(const tiles *s, int kind) {
     const int64_t height = s->rows - s->side + 1, width = s->columns - s->side + 1;  // of the largest tile
-    work w = {.s = s, .down = s->down, .across = s->across};
+    work w = {.s = s, .down = s->over.down, .across = s->over.across};
     int64_t *edges[2] = {0, 0};
-    w.row_edges = s->row_edges, w.column_edges = s->column_edges;
-    if (!s->node_rows) {
+    w.row_edges = s->over.row_edges, w.column_edges = s->over.column_edges;
+    if (!s->over.node_rows) {
         w.down = (s->height + height - 1) / height, w.across = (s->width + width - 1) / width;
         w.row_edges = edges[0] = even_edges(s->height, height, w.down);
         w.column_edges = edges[1] = even_edges(s->width, width, w.across);
