@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-from itertools import permutations
-
 import pytest
 
-from tests.augmentation.coded_scene import MarkDepth, assert_aligned, coded_scene
 from tests.augmentation.optional import need
 
 need("albumentations")
@@ -34,16 +31,6 @@ def captured(optics: torch.nn.Module, image: np.ndarray, depth: np.ndarray) -> n
 
 
 class TestOpticsTransform(BaseTester):
-    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
-    def test_smoke(self, kind):
-        given = arrays()
-        top = 1 if kind is np.float32 else np.iinfo(kind).max
-        out = A.Compose([OpticsTransform(camera())], **DEPTH)(
-            image=(given["image"] * top).astype(kind), depth=given["depth"]
-        )
-        assert out["image"].dtype == kind
-        assert np.isfinite(out["image"]).all()
-
     @pytest.mark.parametrize("shape", [(40, 48), (40, 48, 1), (40, 48, 3)])
     @pytest.mark.parametrize("axis", [False, True])
     def test_cardinality(self, shape, axis):
@@ -60,23 +47,6 @@ class TestOpticsTransform(BaseTester):
         expected = captured(optics, **flipped)[10:30, 12:36]
         assert np.abs(out["image"] - expected).max() < 1e-6
         assert np.array_equal(out["depth"], flipped["depth"][10:30, 12:36])
-
-    @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-    def test_feature_image_and_depth_stay_aligned_in_any_order(self, order):
-        optics, given = camera(sensor=None), arrays()
-        parts = [A.VerticalFlip(p=1.0), OpticsTransform(optics)]
-        out = A.Compose([parts[n] for n in order], **DEPTH)(**given)
-        assert np.array_equal(out["depth"], given["depth"][::-1])
-        both = [captured(optics, given["image"][::-1], given["depth"][::-1]), captured(optics, **given)[::-1]]
-        assert min(np.abs(out["image"] - one).max() for one in both) < 1e-6
-
-    @pytest.mark.parametrize("order", list(permutations(range(3))))
-    @pytest.mark.parametrize("warp", [A.HorizontalFlip(p=0.5), A.RandomCrop(20, 24), A.Rotate((90, 90), p=1.0)])
-    def test_property_aligned_in_all_orders(self, warp, order):
-        parts = [warp, OpticsTransform(MarkDepth(p=1.0)), A.CoarseDropout(fill_mask=None, p=1.0)]
-        image, depth = (x[0].permute(1, 2, 0).numpy() for x in coded_scene())
-        out = A.Compose([parts[n] for n in order], **DEPTH)(image=image, depth=depth)
-        assert_aligned(*(torch.from_numpy(out[name]).permute(2, 0, 1)[None] for name in ("image", "depth")))
 
     def test_feature_eight_bit_images_stay_eight_bit(self):
         optics, given = camera(sensor=None), arrays(np.uint8)
@@ -107,14 +77,6 @@ class TestOpticsTransform(BaseTester):
         given = arrays()
         out = A.Compose([OpticsTransform(camera(), p=0.0)], **DEPTH)(**given)
         assert np.array_equal(out["image"], given["image"])
-
-    def test_feature_holes_of_a_rotation_are_filled_for_the_capture(self):
-        given = arrays()
-        chain = [A.Rotate((30, 30), p=1.0), OpticsTransform(camera(), holes="fill")]
-        out = A.Compose(chain, **FILLED)(**given)
-        assert np.isin(out["depth"], given["depth"]).all()
-        assert (out["valid"].dtype, set(np.unique(out["valid"]))) == (np.uint8, {0, 1})
-        assert np.isfinite(out["image"]).all()
 
     def test_feature_the_mask_of_holes_is_moved_beyond_the_image_too(self):
         """Whether or not the picture is taken, so that a data loader finds one set of keys."""

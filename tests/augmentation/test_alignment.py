@@ -35,24 +35,6 @@ def assert_told(error: ValueError) -> None:
 
 
 class TestAlignment(BaseTester):
-    @pytest.mark.parametrize("geometry", list(GEOMETRY))
-    @pytest.mark.parametrize("photometry", list(PHOTOMETRY))
-    def test_property_all_orders_in_augmentation_sequential(self, geometry, photometry):
-        """Of geometry, tap, optics and photometry: 24 orders."""
-        aligned = 0
-        for order in permutations(range(4)):
-            optics = MarkDepth(p=1.0)
-            parts = [GEOMETRY[geometry](), optics.depth_tap, optics, PHOTOMETRY[photometry]()]
-            chain = K.AugmentationSequential(*(parts[n] for n in order), data_keys=["input", "mask"])
-            try:
-                image, depth = chain(*coded_scene())
-            except ValueError as error:
-                assert_told(error)
-            else:
-                assert_aligned(image, depth)
-                aligned += 1
-        assert aligned == 6  # those with the tap directly before the optics
-
     @settings(max_examples=25)
     @given(st.lists(st.sampled_from([*GEOMETRY, *PHOTOMETRY, "tap", "optics"]), min_size=2, max_size=6), st.booleans())
     def test_property_any_list_of_augmentations(self, names, shuffled):

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import kornia.augmentation as K
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import convolve
 
 from kornia_tidy import NoMask, TiDyOptics
-from kornia_tidy.augmentation import DepthBlur, RandomDepthBlur, depth_blur
+from kornia_tidy.augmentation import RandomDepthBlur, depth_blur
 from kornia_tidy.augmentation.depth_blur import blur_radius, disc, disc_radius
 from kornia_tidy.optics import Lens
 from tests.base import BaseTester
@@ -25,26 +24,6 @@ def sampled_disc(radius: float, side: int, samples: int = 40) -> np.ndarray:
 
 
 class TestDepthBlur(BaseTester):
-    def test_smoke(self, device, dtype):
-        image, depth = (x.to(device) for x in scene(2))
-        blurred = depth_blur(image.to(dtype), depth, 1.0, 2.8, **LENS)
-        assert blurred.dtype == dtype
-        assert ((blurred >= 0) & (blurred <= 1 + 1e-6)).all()
-
-    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
-    def test_feature_half_precision_is_float32_rounded_once(self, kind):
-        image, depth = scene(1)
-        image = image.to(kind)
-        expected = depth_blur(image.float(), depth, 1.0, 2.8, **LENS)
-        self.assert_close(depth_blur(image, depth, 1.0, 2.8, **LENS), expected.to(kind))
-
-    @pytest.mark.parametrize("channels", [1, 3, 4])
-    @pytest.mark.parametrize("batch", [0, 1, 2])
-    def test_cardinality(self, batch, channels):
-        image, depth = torch.rand(batch, channels, 20, 24), torch.ones(batch, 1, 20, 24)
-        assert DepthBlur(0.6, 2.0, **LENS)(image, depth).shape == image.shape
-        assert RandomDepthBlur(p=1.0)(image, depth).shape == image.shape
-
     @pytest.mark.parametrize("depth", [0.3, 0.9, 2.0, float("inf")])
     def test_feature_one_depth_is_a_convolution_with_its_disc(self, depth):
         """Against scipy with a disc of counted points, at the largest disc: the f-number is chosen for it."""
@@ -132,13 +111,6 @@ class TestDepthBlur(BaseTester):
         with pytest.raises(TypeError, match="image must be floating point"):
             depth_blur(image.byte(), depth, 1.0, 2.0)
 
-    def test_gradcheck(self):
-        image, depth = scene(1, channels=1, height=6, width=7)
-        depth = depth.clamp(max=2.0).double() + 1e-3
-        self.gradcheck(
-            lambda x, z: depth_blur(x, z, 0.6, 4.0, color_space="linear", **LENS), (image, depth), eps=1e-6, atol=1e-4
-        )
-
     def test_smoke_discs_sum_to_one(self):
         for radius in (0, 0.5, 1.0, 3.3, 16.0):
             assert abs(float(disc(radius, 33).sum()) - 1) < 1e-12
@@ -152,25 +124,6 @@ class TestRandomDepthBlur(BaseTester):
         drawn = augmentation._params
         self.assert_close(blurred, depth_blur(image, depth, drawn["focus_distance"], drawn["f_number"], **LENS))
         assert torch.equal(augmentation(image, depth, params=drawn), blurred)
-
-    def test_feature_rows_that_are_left_out_keep_their_bits(self):
-        image, depth = scene(6)
-        augmentation = RandomDepthBlur(p=0.5, f_number=(1.0, 1.2), **LENS)
-        blurred = augmentation(image, depth)
-        left = augmentation._params["batch_prob"] < 0.5
-        assert 0 < left.sum() < 6
-        assert torch.equal(blurred[left], image[left])
-        assert not (blurred[~left] == image[~left]).flatten(1).all(1).any()
-
-    def test_feature_in_augmentation_sequential(self):
-        image, depth = scene(2)
-        blur = RandomDepthBlur(p=1.0, **LENS)
-        chain = K.AugmentationSequential(K.RandomVerticalFlip(p=1.0), blur.depth_tap, blur, data_keys=["input", "mask"])
-        blurred, warped = chain(image, depth)
-        assert torch.equal(warped, depth.flip(-2))
-        drawn = chain._params[-1].data
-        expected = depth_blur(image.flip(-2), warped, drawn["focus_distance"], drawn["f_number"], **LENS)
-        self.assert_close(blurred, expected)
 
     def test_exception(self):
         with pytest.raises(ValueError, match="focus_distance must be beyond the focal length"):

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 
-import kornia.augmentation as K
 import pytest
 import torch
 
@@ -38,14 +37,6 @@ class Plain(torch.nn.Module):
 
 
 class TestRandomTiDyOptics(BaseTester):
-    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-    def test_smoke(self, device, kind):
-        image, depth = (x.to(device) for x in scene(2))
-        coded = RandomTiDyOptics(camera().to(device), **ALL, p=1.0)(image.to(kind), depth)
-        assert coded.dtype == kind
-        assert coded.shape == image.shape
-        assert coded.isfinite().all()
-
     @pytest.mark.parametrize("keepdim", [True, False])
     @pytest.mark.parametrize("shape", [(2, 3), (3,), (1, 1), (0, 3)])
     def test_cardinality(self, shape, keepdim):
@@ -144,13 +135,6 @@ class TestRandomTiDyOptics(BaseTester):
         assert not torch.equal(coded[0], image[0])
         assert torch.equal(RandomTiDyOptics(camera(), p=0.0)(image, depth), image)
 
-    def test_feature_same_on_batch(self):
-        image, depth = (x.expand(3, -1, -1, -1) for x in scene(1))
-        coded = RandomTiDyOptics(camera(), **ALL, p=1.0, same_on_batch=True)(image, depth)
-        self.assert_close(coded[1:], coded[:1].expand(2, -1, -1, -1), rtol=0, atol=1e-6)
-        coded = RandomTiDyOptics(camera(), **ALL, p=1.0)(image, depth)
-        assert (coded[0] - coded[1]).abs().max() > 1e-2
-
     def test_feature_depth_is_read_in_float32_whatever_the_image_is(self):
         """Between 0.595 m and 0.6 m bfloat16 knows four depths: a wide aperture tells them apart."""
         image, depth = scene(1)
@@ -180,17 +164,6 @@ class TestRandomTiDyOptics(BaseTester):
         optics(image, depth)
         assert set(optics._params) == {*ALL, "seed", "batch_prob", "forward_input_shape"}
         assert all(value.numel() <= 4 for value in optics._params.values())
-
-    def test_feature_reproducible_by_the_global_seed(self):
-        """kornia's own check of augmentations: a seed, and params of the last call, repeat a result."""
-        sequence = K.ImageSequential(optics := RandomTiDyOptics(camera(), **ALL, p=0.5))
-        image, depth = scene(3)
-        results = []
-        for _ in range(2):
-            torch.manual_seed(3)
-            results.append(optics(image, depth))
-        assert torch.equal(*results)
-        assert len(sequence.forward_parameters(image.shape)) == 1
 
     def test_exception_ranges(self):
         with pytest.raises(ValueError, match=r"exposure must be a range \(low, high\) with 0 < low <= high"):
@@ -222,12 +195,6 @@ class TestRandomTiDyOptics(BaseTester):
             optics(image)
         with pytest.raises(ValueError, match=r"depth must have shape \(B, 1, H, W\)"):
             optics(image, depth[0])
-
-    def test_gradcheck(self):
-        optics = RandomTiDyOptics(camera(sensor=None, check_inputs=False), exposure=(0.5, 1.0), p=1.0)
-        image, depth = scene(1, height=12, width=12)
-        params = optics.forward_parameters(image.shape)
-        self.gradcheck(lambda x: optics(x, depth.double(), params=params), (image,))
 
     @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
     def test_dynamo(self):

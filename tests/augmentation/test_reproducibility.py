@@ -146,8 +146,15 @@ class TestReproducibility(BaseTester):
         assert not torch.equal(own[:1].expand_as(own), own)
 
 
+@pytest.mark.parametrize("name", AUGMENTATIONS)
 class TestProbability(BaseTester):
-    @pytest.mark.parametrize("name", AUGMENTATIONS)
+    def test_feature_images_that_are_left_out_keep_their_bits(self, name):
+        made, (image, depth) = Alone(AUGMENTATIONS[name](p=0.5)), scene(6)
+        changed, left = made(image, depth).detach(), made.module._params["batch_prob"] < 0.5
+        assert 0 < left.sum() < 6
+        assert torch.equal(changed[left], image[left])
+        assert not (changed[~left] == image[~left]).flatten(1).all(1).any()
+
     @pytest.mark.parametrize("p", [2.0, -0.1, float("nan")])
     def test_exception(self, name, p):
         with pytest.raises(ValueError, match=rf"p must be a probability from 0 to 1, got {p}$"):

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 
-import kornia.augmentation as K
 import pytest
 import torch
 
@@ -14,17 +13,6 @@ SIGMAS = 6  # standard errors that a mean or a deviation may be off
 
 
 class TestSensorNoise(BaseTester):
-    def test_smoke(self, device, dtype):
-        image = torch.rand(2, 3, 8, 9, device=device, dtype=dtype)
-        noisy = sensor_noise(image, 500.0, 3.0, 2.0, bits=8)
-        assert noisy.dtype == dtype
-        assert ((noisy >= 0) & (noisy <= 1)).all()
-
-    @pytest.mark.parametrize("shape", [(0, 3, 4, 4), (1, 1, 4, 4), (3, 4, 4, 4)])
-    def test_cardinality(self, shape):
-        assert sensor_noise(torch.rand(shape), 500.0).shape == shape
-        assert RandomSensorNoise(p=1.0)(torch.rand(shape)).shape == shape
-
     def test_feature_mean_and_variance_of_light_are_those_of_photon_transfer(self):
         """Variance (w x + d + sigma^2) / w^2: EMVA 1288, section 2."""
         well, sigma, dark, light = 1000.0, 5.0, 20.0, 0.3
@@ -80,19 +68,8 @@ class TestSensorNoise(BaseTester):
         with pytest.raises(TypeError, match="image must be floating point"):
             sensor_noise(image.byte(), 100.0)
 
-    def test_gradcheck(self):
-        """Above 25 electrons, where the draw is smooth in the light."""
-        image = 0.3 + 0.3 * torch.rand(1, 1, 4, 4, dtype=torch.float64)
-        fields = SensorNoise(1.0, full_well=1.0).draw(image.shape, dtype=torch.float64)
-        self.gradcheck(lambda x: sensor_noise(x, 1e4, 3.0, bits=None, params=fields), (image,))
-
 
 class TestRandomSensorNoise(BaseTester):
-    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-    def test_smoke(self, kind):
-        image = torch.rand(2, 3, 8, 8).to(kind)
-        assert RandomSensorNoise(p=1.0)(image).dtype == kind
-
     def test_feature_is_the_function_with_the_drawn_sensor(self):
         image = torch.rand(3, 3, 8, 8)
         augmentation = RandomSensorNoise(dark=(1.0, 5.0), p=1.0)
@@ -101,28 +78,6 @@ class TestRandomSensorNoise(BaseTester):
             values = (float(drawn[name][row]) for name in ("full_well", "read_noise", "dark"))
             source = torch.Generator().manual_seed(int(drawn["seed"][row]))
             self.assert_close(noisy[row : row + 1], sensor_noise(image[row : row + 1], *values, generator=source))
-
-    def test_feature_the_same_params_give_the_same_bits(self):
-        image = torch.rand(5, 3, 8, 8)
-        chain = K.AugmentationSequential(RandomSensorNoise(p=0.5), K.RandomHorizontalFlip(), data_keys=["input"])
-        first = chain(image)
-        assert torch.equal(chain(image, params=chain._params), first)
-
-    def test_feature_rows_that_are_left_out_keep_their_bits(self):
-        image = torch.rand(6, 3, 8, 8)
-        augmentation = RandomSensorNoise(p=0.5)
-        noisy = augmentation(image)
-        left = augmentation._params["batch_prob"] < 0.5
-        assert 0 < left.sum() < 6
-        assert torch.equal(noisy[left], image[left])
-        assert not (noisy[~left] == image[~left]).flatten(1).all(1).any()
-
-    def test_feature_same_on_batch_is_one_draw_noise_included(self):
-        image = torch.rand(1, 3, 8, 8).expand(3, -1, -1, -1)
-        noisy = RandomSensorNoise(p=1.0, same_on_batch=True)(image)
-        assert torch.equal(noisy[0], noisy[1])
-        noisy = RandomSensorNoise(p=1.0)(image)
-        assert not torch.equal(noisy[0], noisy[1])
 
     def test_exception(self):
         with pytest.raises(ValueError, match="dark must stay below full_well, got up to 600 of 500 electrons"):

@@ -44,9 +44,6 @@ class TestMain(BaseTester):
             command_line.main(["--version"])
         assert capsys.readouterr().out.startswith("kornia-tidy 0.")
 
-    def test_feature_all_well_returns_zero(self, command_that):
-        assert command_line.main(command_that(lambda: None)) == 0
-
     @pytest.mark.parametrize(
         "error",
         [

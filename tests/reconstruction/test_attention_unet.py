@@ -27,12 +27,6 @@ class TestAttentionUNet(BaseTester):
             head = AttentionUNet(out_channels=outputs)
         assert sum(p.numel() for p in head.parameters()) == parameters
 
-    def test_feature_channels_go_from_64_to_1024(self):
-        with torch.device("meta"):
-            head = AttentionUNet(in_channels=1)
-        assert [level[0].out_channels for level in head.encoder] == [64, 128, 256, 512, 1024]
-        assert head.encoder[0][0].in_channels == 1
-
     def test_feature_the_gate_is_its_formula(self):
         gate = AttentionUNet(width=4).double().eval().decoder[0].gate
         for parameter in gate.parameters():
@@ -43,8 +37,3 @@ class TestAttentionUNet(BaseTester):
         inner = np.maximum(mixed(g[0].numpy(), *gate.decoder) + mixed(x[0].numpy(), *gate.encoder), 0)
         weight = 1 / (1 + np.exp(-mixed(inner, *gate.weight[:2])))
         self.assert_close(gate(g, x)[0], torch.from_numpy(weight * x[0].numpy()), rtol=1e-12, atol=1e-12)
-
-    def test_feature_outputs_are_not_bounded(self, device, dtype):
-        out = AttentionUNet(width=4).to(device, dtype)(torch.rand(2, 3, 32, 32, device=device, dtype=dtype))
-        assert out.min() < 0
-        assert out.max() > 1

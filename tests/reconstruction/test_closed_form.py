@@ -133,16 +133,6 @@ class TestClosedForm(BaseTester):
                 smooth = restore._smooth(expected, torch.full((1, 1, 1, 1), color))
                 self.assert_close(image, smooth, atol=1e-6, rtol=0)
 
-    @pytest.mark.parametrize("layers", [0, 3])
-    def test_feature_a_state_of_the_wiener_filter(self, layers):
-        restore, loaded, capture = (
-            closed_form(layers=layers, inverse="wiener"),
-            ClosedForm(layers, inverse="wiener"),
-            photo(9, 9),
-        )
-        loaded.double().load_state_dict(restore.state_dict())
-        assert torch.equal(loaded(capture).maps, restore(capture).maps)
-
     @pytest.mark.parametrize("noise", [0.002, 0.008])
     def test_feature_the_bilateral_is_that_of_the_definition(self, noise):
         capture, color = photo(14, 13), 0.2 * math.sqrt(noise / 0.002)
@@ -238,13 +228,6 @@ class TestClosedForm(BaseTester):
         loaded = ClosedForm(encoded=False).double()
         loaded.load_state_dict(stray.state_dict())
         self.assert_close(loaded(capture + 0.2 * mean, 0.01).image, found.image)
-
-    def test_feature_gradients_reach_the_psfs(self):
-        psfs = bank().psfs.requires_grad_()
-        restore = ClosedForm().double()
-        restore.set_psfs(PSFBank(psfs, torch.arange(4.0), torch.ones(4, 3)))
-        restore(photo(12, 12), 0.01).image.square().sum().backward()
-        assert all(bool(part.any()) for part in psfs.grad.flatten(0, 1))
 
     def test_feature_half_precision_is_computed_in_float32(self):
         restore, capture = closed_form(torch.float32), photo(16, 16, dtype=torch.float32)

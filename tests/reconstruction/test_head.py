@@ -112,13 +112,6 @@ class TestReconstructionHead(BaseTester):
 
 class TestEveryHead(BaseTester):
     @every_head
-    def test_smoke(self, name, device, dtype):
-        head = fresh(name).to(device, dtype)
-        out = head(torch.rand(2, 3, 64, 64, device=device, dtype=dtype))
-        assert out.dtype == dtype
-        assert out.isfinite().all()
-
-    @every_head
     def test_cardinality(self, name, device):
         head = fresh(name).to(device).eval()
         for size in [(32, 64), (33, 31), (1, 50), (17, 3), (1, 1)]:

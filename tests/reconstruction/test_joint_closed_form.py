@@ -12,7 +12,6 @@ from kornia_tidy.reconstruction import (
     ClosedFormHead,
     JointClosedFormHead,
     JointHead,
-    LayeredJointHead,
     NAFNet,
     UncertainJointEstimate,
     closed_form_channels,
@@ -30,19 +29,16 @@ from kornia_tidy.reconstruction.closed_form import (
     WINDOW,
     ClosedForm,
 )
-from kornia_tidy.reconstruction.depth_distribution import depth_moments, layer_weights
+from kornia_tidy.reconstruction.depth_distribution import layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.guided_classes import smoothed_classes
 from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.joint_closed_form import as_refiner, widened_for_depth
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
-from kornia_tidy.reconstruction.trained import build_head
 from tests.base import BaseTester
 from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
-from tests.reconstruction.test_layered_joint import box_bank, scene
 
 LAYERS, CLASSES = 4, 7
 
@@ -146,31 +142,6 @@ class TestJointClosedFormHead(BaseTester):
         assert not logits.grad[:CLASSES].any()
         assert logits.grad[CLASSES:].all()
 
-    def test_feature_finds_on_which_side_of_an_edge_a_texture_is_near(self):
-        _, depth, capture = scene()
-        head = joint(box_bank(), 3, encoded=False)
-        with torch.no_grad():
-            found = JointHead(head)(capture).depth
-        assert found[depth == 1].mean() > found[depth == 0].mean() + 0.1  # averaged over the edge: no colour tells it
-
-    def test_feature_stray_light_is_taken_away_first(self):
-        """A bank with stray light and a capture with it give the depth that both have without it."""
-        plain, capture = bank(LAYERS), photo(32, 32)
-        share = torch.full((LAYERS, 3), 0.1, dtype=torch.float64)
-        light = rgb_to_linear_rgb(capture)
-        with_veil = 0.9 * light + 0.1 * light.mean((-2, -1), keepdim=True)
-        dim = PSFBank(0.9 * plain.psfs, plain.defocus, 0.9 * plain.energy, share)
-        without = joint(PSFBank(dim.psfs, dim.defocus, dim.energy), dtype=torch.float64, encoded=False)
-        expected = without(0.9 * light)[:, :CLASSES]
-        self.assert_close(joint(dim, dtype=torch.float64, encoded=False)(with_veil)[:, :CLASSES], expected)
-
-    def test_feature_correlated_captures_have_flipped_psfs(self):
-        flipped = PSFBank.from_measured(bank(LAYERS).psfs.flip((-2, -1)), bank(LAYERS).defocus)
-        head, other = joint(dtype=torch.float64), joint(flipped, dtype=torch.float64)
-        head.closed_form.set_psfs(bank(LAYERS), correlate=True)
-        capture = photo(32, 32)
-        self.assert_close(head(capture), other(capture))
-
     def test_feature_the_likelihood_takes_the_middle_of_wide_psfs(self):
         side = LIKELIHOOD_WINDOW
         narrow = torch.rand(2, 3, side, side)
@@ -206,22 +177,6 @@ class TestJointClosedFormHead(BaseTester):
             optimizer.step()
         assert all(parameter.grad.any() for parameter in head.parameters())
 
-    def test_feature_a_state_needs_no_camera(self):
-        head, other = joint(trained=True), joint(bank(LAYERS, side=7, dtype=torch.float32))
-        other.load_state_dict(head.state_dict())
-        capture = photo(16, 16, dtype=torch.float32)
-        with torch.no_grad():
-            assert torch.equal(other(capture), head(capture))
-
-    @pytest.mark.parametrize("closed_form", [True, False])
-    def test_feature_settings_choose_the_head(self, closed_form):
-        settings = SystemSettings(
-            task="joint", depth_classes=5, refocus=3, head="nafnet", width=2, closed_form=closed_form
-        )
-        head = build_head(settings)
-        assert type(head) is (JointClosedFormHead if closed_form else LayeredJointHead)
-        assert head.out_channels == 5 + 3
-
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("kind", "refined"), [(NAFNet, False), (PlainHead, False), (PlainHead, True)])
     def test_feature_tiles_are_the_whole(self, kind, refined):
@@ -240,16 +195,6 @@ class TestJointClosedFormHead(BaseTester):
         capture = photo(18, 21, dtype=torch.float32)
         head = JointHead(joint(layers=2, trained=True, kind=PlainHead, refined=True))
         assert len(check_onnx(head, capture, capture.flip(-1))) == 3
-
-    def test_feature_half_precision_autocast_is_near(self):
-        """Depth differs by a few roundings of 2^-9 of its logits."""
-        head, capture = joint(trained=True), photo(32, 32, dtype=torch.float32)
-        with torch.no_grad():
-            expected = head(capture, 0.01)
-            with torch.autocast("cpu", dtype=torch.bfloat16):
-                found = head(capture, 0.01).float()
-        depths = [depth_moments(output[:, :CLASSES])[0] for output in (expected, found)]
-        self.assert_close(depths[1], depths[0], atol=0.02, rtol=0)
 
     @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
     @pytest.mark.parametrize("layers", [0, LAYERS])

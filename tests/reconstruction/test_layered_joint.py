@@ -111,12 +111,6 @@ class TestDeconvolutionFilters(BaseTester):
 
 
 class TestLayeredJointHead(BaseTester):
-    def test_smoke(self, device, dtype):
-        head = layered(dtype=dtype).to(device)
-        output = head(torch.rand(2, 3, 21, 40, device=device, dtype=dtype))
-        assert output.shape == (2, CLASSES + 3, 21, 40)
-        assert output.dtype == dtype
-
     def test_feature_blended_by_the_true_depth_is_better_than_by_any_constant(self):
         image, depth, capture = scene()
 
@@ -126,15 +120,6 @@ class TestLayeredJointHead(BaseTester):
 
         constants = [score(torch.full_like(depth, value)) for value in (0.0, 0.5, 1.0)]
         assert score(depth) > max(*constants, psnr(capture, image).item()) + 1
-
-    def test_feature_an_unsure_blend_is_the_mean_of_the_layers(self):
-        """Half near, half far, by the same head told the one and the other."""
-        _, depth, capture = scene()
-        far, near, both = (torch.zeros(1, CLASSES, *depth.shape[-2:]) for _ in range(3))
-        far[:, 0] = near[:, -1] = 50.0
-        both[:, 0] = both[:, -1] = 50.0
-        images = [told(logits, encoded=False)(capture)[:, -3:] for logits in (far, near, both)]
-        self.assert_close(images[2], (images[0] + images[1]) / 2, atol=1e-6, rtol=0)
 
     def test_feature_the_initial_depth_is_the_likelihood_in_closed_form(self):
         """And finds on which side of an edge a texture is near."""
@@ -188,20 +173,6 @@ class TestLayeredJointHead(BaseTester):
         self.assert_close(after[:, :CLASSES], before[:, :CLASSES] / 2)
         assert torch.equal(after[:, CLASSES:], before[:, CLASSES:])
         assert torch.equal(trained, before)
-
-    def test_feature_temperature_is_in_the_state_and_filters_are_not(self):
-        names = set(layered().state_dict())
-        assert "temperature" in names
-        assert "filters" not in names
-
-    def test_feature_a_joint_head_names_the_maps(self):
-        head, capture = layered(), torch.rand(1, 3, 20, 24)
-        with torch.no_grad():
-            estimate, output = JointHead(head)(capture), head(capture)
-        assert isinstance(estimate, UncertainJointEstimate)
-        mean, deviation = depth_moments(output[:, :CLASSES])
-        for part, expected in zip(estimate, (mean, output[:, -3:], deviation), strict=True):
-            assert torch.equal(part, expected)
 
     def test_feature_tiles_are_the_whole(self):
         head = JointHead(stirred(width=2)).eval()

@@ -78,9 +78,3 @@ class TestNAFNet(BaseTester):
     def test_exception_repeats(self):
         with pytest.raises(ValueError, match="repeats must be a whole number of at least 1, got 0"):
             NAFNet(width=4, repeats=0)
-
-    def test_smoke_any_number_of_channels(self):
-        head = NAFNet(19, 4, width=2)
-        assert isinstance(head.last, nn.Conv2d)
-        assert list(head.modules())[-1] is head.last
-        assert head(torch.rand(1, 19, 17, 20)).shape == (1, 4, 17, 20)

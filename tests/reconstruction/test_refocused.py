@@ -72,12 +72,6 @@ class TestInverseFilters(BaseTester):
 
 
 class TestRefocused(BaseTester):
-    def test_smoke(self, device, dtype):
-        head = refocused(AttentionUNet(7, 4, width=2)).to(device, dtype)
-        image = torch.rand(2, 3, 21, 40, device=device, dtype=dtype)
-        assert head(image).shape == (2, 4, 21, 40)
-        assert head(image).dtype == dtype
-
     @pytest.mark.parametrize("size", [(20, 33), (3, 12)])
     def test_feature_shows_convolutions_with_the_filters(self, size):
         """By SciPy; in a side as short as a filter's half the outermost pixel is repeated."""

@@ -8,7 +8,6 @@ import torch
 from kornia_tidy.reconstruction import AttentionUNet, PhaseCam3DUNet, Residual
 from kornia_tidy.reconstruction.heads import PlainHead
 from tests.base import BaseTester
-from tests.reconstruction.onnx_export import check_onnx
 
 
 class TestResidual(BaseTester):
@@ -31,22 +30,6 @@ class TestResidual(BaseTester):
         depth, estimate = head(image).split([1, 3], 1)
         assert (depth == 1).all()
         self.assert_close(estimate - image, torch.tensor([0.1, 0.2, 0.3]).view(1, 3, 1, 1).expand_as(image))
-
-    def test_feature_learns_from_zero(self):
-        """The last layer learns at once, and the others as soon as it has."""
-        torch.manual_seed(0)
-        head = Residual(PlainHead(width=4))
-        optimizer = torch.optim.Adam(head.parameters(), 1e-2)
-        image, truth = torch.rand(1, 3, 16, 16), torch.rand(1, 3, 16, 16)
-        for _ in range(2):
-            optimizer.zero_grad()
-            (head(image) - truth).square().mean().backward()
-            optimizer.step()
-        assert all(p.grad.abs().max() > 0 for p in head.parameters())
-
-    @pytest.mark.takes_seconds
-    def test_feature_onnx(self):
-        check_onnx(Residual(PlainHead(3, 4, width=2)), torch.rand(1, 3, 13, 16))
 
     @pytest.mark.parametrize(
         ("network", "sentence"),

@@ -11,7 +11,7 @@ from kornia_tidy import SensorNoise
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import RuledClosedForm, reconstruct_tiled
-from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES, ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, band_facts, light_detail, predicted_errors
@@ -43,12 +43,6 @@ def circular(image, kernel):
 
 
 class TestRuledClosedForm(BaseTester):
-    def test_smoke_maps_of_the_closed_form_and_of_the_camera(self):
-        capture = photo(16, 20)
-        restored = ruled(layers=7)(capture, 0.01)
-        assert restored.maps.shape == (2, closed_form_channels(7) + CAMERA_MAPS, 16, 20)
-        self.assert_close(restored.maps[:, :3], capture)
-
     def test_feature_the_error_without_noise_is_that_of_simulated_pictures(self):
         """Periodic pictures of the spectrum, blurred and restored by the definition; 400 of them."""
         psfs = bank(NODES).psfs
@@ -144,13 +138,3 @@ class TestRuledClosedForm(BaseTester):
     def test_gradcheck_captures(self):
         restore = ruled()
         self.gradcheck(lambda capture: restore(capture, 0.01).image, (photo(12, 12),))
-
-    def test_smoke_takes_the_noise_of_a_sensor(self):
-        restore = ruled()
-        restore.set_noise(SensorNoise(0.01))
-        self.assert_close(restore(photo(16, 16)).image, restore(photo(16, 16), 0.01).image)
-
-    def test_feature_other_closed_forms_keep_their_settings(self):
-        plain = ClosedForm(inverse="wiener").double()
-        plain.set_psfs(bank(NODES))
-        assert not torch.equal(plain(photo(16, 16), 0.01).image, ruled()(photo(16, 16), 0.01).image)

@@ -12,16 +12,14 @@ from kornia_tidy.reconstruction import (
     NAFNet,
     SelfEnsemble,
     closed_form_channels,
-    receptive_field,
     self_ensemble,
 )
 from kornia_tidy.reconstruction.heads import PlainHead
 from kornia_tidy.reconstruction.midas_small import MiDaSSmall
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from tests.base import BaseTester
-from tests.reconstruction.onnx_export import check_onnx
 from tests.reconstruction.test_closed_form import bank, photo
-from tests.reconstruction.test_closed_form_head import head_of, small, tiled_and_whole
+from tests.reconstruction.test_closed_form_head import head_of, small
 
 # The symmetries of a square, as NumPy turns arrays (H, W, C).
 SQUARE = [(turns, mirrored) for mirrored in (False, True) for turns in range(4)]
@@ -76,15 +74,6 @@ class TestSelfEnsemble(BaseTester):
             if symmetry != SQUARE[0]:
                 assert (net(turn(image)) - turn(net(image))).abs().max() > 1e-3
 
-    def test_feature_one_orientation_is_the_network(self):
-        net, image = network(), torch.rand(2, 3, 17, 30)
-        with torch.no_grad():
-            assert torch.equal(SelfEnsemble(net, 1)(image), net(image))
-
-    def test_cardinality(self):
-        for size in [(33, 31), (1, 50), (1, 1)]:
-            assert SelfEnsemble(NAFNet(width=2))(torch.rand(2, 3, *size)).shape == (2, 3, *size)
-
     def test_gradcheck(self):
         net = network(torch.float64)
         self.gradcheck(SelfEnsemble(net, 8), (torch.rand(1, 3, 4, 6, dtype=torch.float64),))
@@ -135,17 +124,6 @@ class TestSelfEnsembleOfAHead(BaseTester):
             alone, averaged = JointHead(head)(capture), ensemble(capture)
         for one, other in zip(alone, averaged, strict=True):
             assert (one - other).abs().max() > 1e-4
-
-    def test_feature_tiles_are_the_whole(self):
-        head = self_ensemble(head_of(small(), trained=True))
-        assert receptive_field(head) >= receptive_field(head_of(small(), trained=True))
-        self.assert_close(*tiled_and_whole(head), atol=1e-4, rtol=0)
-
-    @pytest.mark.slow
-    def test_feature_onnx_is_equal(self):
-        net = PlainHead(closed_form_channels(4), 4, width=2)
-        head = self_ensemble(head_of(net, layers=4, trained=True))
-        check_onnx(head, (photo(18, 21, dtype=torch.float32)[:1], torch.full((1, 1, 1, 1), 0.02)))
 
     def test_exception(self):
         with pytest.raises(ValueError, match="begins with the closed form, and MiDaSSmall has none"):

@@ -8,7 +8,7 @@ from kornia_tidy.cli.app import answers
 from kornia_tidy.cli.app.answers import KEPT, PICTURES, answer
 from kornia_tidy.cli.app.capture import take_picture
 from kornia_tidy.cli.app.legends import legends, mistake, status
-from kornia_tidy.cli.app.pictures import CELL, depth_map, mask_colors, masks_and_psfs, photograph, psf_cell
+from kornia_tidy.cli.app.pictures import CELL, mask_colors, masks_and_psfs, photograph, psf_cell
 from kornia_tidy.cli.app.settings import Settings
 from kornia_tidy.data import write_depth, write_image
 from tests.base import BaseTester
@@ -141,16 +141,6 @@ class TestPictures(BaseTester):
         image = torch.tensor([-0.1, 0.5 / 255, 1.6 / 255, 1.2, 1.0, 0.2]).view(3, 1, 2)
         assert photograph(image).tolist() == [[[0, 2, 255], [0, 255, 51]]]
 
-    def test_feature_near_is_bright(self, trained):
-        near, far = (depth_map(torch.full((1, 40, 60), value), trained.camera)[:300].mean() for value in (1.0, 0.0))
-        assert near > 200
-        assert far < 20
-
-    def test_cardinality_a_row_for_each_mask_and_the_average(self, trained, own):
-        """A step of CELL and a gap for each row: five masks and their average, or one mask alone."""
-        rows = (masks_and_psfs(trained).shape[0] - masks_and_psfs(own).shape[0]) / (CELL + 8)
-        assert rows == 5
-
     def test_cardinality_of_many_masks_five_are_shown(self, trained):
         many = take_picture(Settings(camera="own", start="noise", masks=8, **SMALL))
         assert masks_and_psfs(many).shape == masks_and_psfs(trained).shape
@@ -168,6 +158,3 @@ class TestPictures(BaseTester):
         assert cell.shape == (CELL, CELL, 3)
         assert cell[0, 0].tolist() == [1, 0, 0]
         assert cell[-1, -1].tolist() == [0, 0.5, 0]
-
-    def test_feature_an_empty_psf_is_black(self):
-        assert not psf_cell(torch.zeros(3, 5, 5)).any()

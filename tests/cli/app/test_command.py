@@ -6,29 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from kornia_tidy.cli.command_line import main, read_command
+from kornia_tidy.cli.command_line import main
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 class TestCommand(BaseTester):
-    def test_smoke_help_teaches(self, capsys):
-        with pytest.raises(SystemExit) as leaving:
-            main(["app", "--help"])
-        assert leaving.value.code == 0
-        told = capsys.readouterr().out
-        assert "pip install 'kornia-tidy[app]'" in told
-        assert "kornia-tidy app --port 8080" in told
-
     @pytest.mark.parametrize("text", ["0", "80", "65536", "x", "-1", "8080.5", "9" * 400])
     def test_exception_ports(self, text, capsys):
         assert main(["app", f"--port={text}"]) == 2
         assert "--port must be a whole number from 1024 to 65535, got" in capsys.readouterr().err
-
-    def test_feature_the_port_is_free_to_choose(self):
-        assert read_command(["app", "--port", "8080"]).port == 8080
-        assert read_command(["app"]).port is None
 
     @pytest.mark.skipif(importlib.util.find_spec("gradio") is not None, reason="Gradio is installed")
     def test_exception_without_gradio_the_remedy_is_told(self, capsys):

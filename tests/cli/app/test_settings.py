@@ -90,15 +90,6 @@ class TestControls(BaseTester):
         with pytest.raises(ValueError, match=r"Number of the painted scene: give a whole number, got 2\.5"):
             settings_of({"seed": 2.5})
 
-    def test_feature_millimetres_micrometres_and_percent_become_si_units_exactly(self):
-        found = settings_of({"focal_length": 35, "pixel_pitch": 3.45, "noise": 1.1, "masks": 3.0})
-        assert (found.focal_length, found.pixel_pitch, found.noise, found.masks) == (
-            0.035,
-            3.45e-6,
-            0.011,
-            3,
-        )
-
     def test_feature_defaults_lie_in_the_range_of_their_controls(self):
         limited = [c for c in CONTROLS if c.low is not None and c.high is not None]
         assert [c.name for c in limited if not c.low <= c.value <= c.high] == []

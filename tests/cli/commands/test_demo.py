@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import re
-import sys
 
 import pytest
 import torch
@@ -94,11 +93,4 @@ class TestDemo(BaseTester):
         monkeypatch.chdir(tmp_path)
         assert main(["demo", "--image", "a.png"]) == 2
         assert "--image and --depth belong together" in capsys.readouterr().err
-        assert list(tmp_path.iterdir()) == []
-
-    def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        assert main(["demo"]) == 2
-        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []

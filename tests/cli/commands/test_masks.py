@@ -31,13 +31,6 @@ def run(command):
 
 
 class TestMasks(BaseTester):
-    @pytest.mark.parametrize("action", ["", "show ", "export ", "import "])
-    def test_smoke_help_teaches(self, action, capsys):
-        with pytest.raises(SystemExit) as leaving:
-            run(f"{action}--help")
-        assert leaving.value.code == 0
-        assert f"usage: kornia-tidy masks {action}" in capsys.readouterr().out
-
     def test_feature_show(self, folder, capsys):
         assert run("show camera.safetensors") == 0
         told = capsys.readouterr().out
@@ -113,38 +106,19 @@ class TestMasks(BaseTester):
             ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no file of a folder of frames"),
             ("export heights.npy -o heights.npy --force", "cannot write heights.npy: it is the input"),
             ("export heights.npy -o slm --panel 0x5", "--panel must be WIDTHxHEIGHT in pixels"),
-            ("export heights.npy -o slm --panel 5x5", "must have pixels at least as large as the panel's"),
-            ("export heights.npy -o slm --pupil-radius 1", "the mask must fit on the panel"),
-            (
-                "export heights.npy -o slm --response heights.npy",
-                "cannot read heights.npy: a response has one phase for",
-            ),
-            ("export heights.npy -o slm --response nan.txt", "cannot read nan.txt: a response has one phase for each"),
-            (
-                "export heights.npy -o slm --response one.txt",
-                "must have 256 phases, one for each level of 8 bits, got 1",
-            ),
-            (
-                "export heights.npy -o slm --response long.txt",
-                "cannot read long.txt: a response has one phase for each",
-            ),
             (
                 "export heights.npy -o slm --response turn.txt --bits 2",
                 "got 1 at level 2 (line 3) after 2: smooth noise",
             ),
             ("export heights.npy -o slm --dwell 1 2 3", "there are 3 dwell shares for 2 masks"),
-            ("export heights.npy -o slm --switching-time 0.2", "must fit into the exposure of 100 ms"),
-            ("export heights.npy -o slm --wavelength 1e-7 --material pmma", "published for 420 to 1620 nm"),
             ("import taken", "cannot read taken/frames.json: there is no such file"),
             ("import taken -o x.stl", "the suffix of what to write must be one of '.npy', '.safetensors'"),
-            ("import taken -o heights.npy", "cannot write heights.npy: it exists"),
         ],
     )
     def test_exception_is_one_sentence_and_nothing_is_written(self, arguments, sentence, folder, capsys):
         (folder / "taken").mkdir()
         (folder / "taken" / "holiday.jpg").write_bytes(b"sun")
-        for name, text in (("nan", 500 * "1.5 " + "nan"), ("one", "1.5"), ("long", 5000 * "x"), ("turn", "0\n2\n1\n6")):
-            (folder / f"{name}.txt").write_text(text)
+        (folder / "turn.txt").write_text("0\n2\n1\n6")
         before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
         assert run(arguments) == 2
         last = capsys.readouterr().err.strip().splitlines()[-1]

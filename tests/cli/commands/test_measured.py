@@ -114,9 +114,7 @@ class TestRawReconstruct(BaseTester):
             (["shot.dng", "--psfs", "noise.json", "--noise", "0.01"], "noise.json"),
             (["shot.dng", *PSFS, "--noise", "bank.safetensors"], "not a readable noise calibration"),
             (["shot.dng", "--psfs", "gone.safetensors", "--noise", "0.01"], "there is no such file"),
-            (["shot.dng", "--psfs", "bank.safetensors", "--noise", "gone.json"], "there is no file gone.json"),
             (["shot.dng", "--head", "edof-5", *MEASURED], "the network is for depths from 0.2975 to inf m"),
-            (["shot.dng", "--head", "edof-designed", *MEASURED], "the network is for"),
             (["shot.dng", "--head", "plain.safetensors", *PSFS], "--psfs is for a network that deconvolves"),
         ],
     )  # fmt: skip

@@ -94,13 +94,6 @@ class TestPsf(BaseTester):
         assert rows(capsys.readouterr().out) != named
 
     @pytest.mark.takes_seconds
-    def test_feature_a_named_lens_brings_its_focal_length(self, tmp_path, capsys):
-        words = ["--f-number", "11", "--focus-distance", "0.8", "--depth-range", "0.7", "0.9", "--depths", "0.8"]
-        output = ["--fidelity", "draft", "-o", str(tmp_path / "a.png")]
-        assert main(["psf", "--lens", "double-gauss-50mm", *words, *output]) == 0
-        assert "51.4973 mm f/11, focus at 0.8 m" in capsys.readouterr().out
-
-    @pytest.mark.takes_seconds
     def test_feature_a_file_of_surfaces_is_traced_at_the_f_number_and_focus_of_the_options(self, tmp_path, capsys):
         (tmp_path / "lens.zmx").write_text(zemax(doublet()))
         words = ["--f-number", "11", "--focus-distance", "1.8", "--depths", "1.8", "--fidelity", "draft"]
@@ -113,12 +106,9 @@ class TestPsf(BaseTester):
         [
             (["--lens", "a.zmx"], "a.zmx must say its largest field, in angles or in heights on the sensor"),
             (["--lens", "a.zmx", "--focal-length", "0.04"], "the lens a.zmx has its own: leave out --focal-length"),
-            (["--lens", "b.zmx"], "cannot read b.zmx: it must have an object, surfaces and a sensor, got 0 of them"),
             ([], "there is no camera: give CAMERA, --lens, or both"),
             (["--lens", "single-5mm"], "--lens must be one of 'double-gauss-50mm', 'triplet-50mm'"),
-            (["--lens", "single-50mm", "--focal-length", "0.04"], "has its own: leave out --focal-length"),
             (["--lens", "a.lens", "--f-number", "8"], "the lens a.lens has its own: leave out --f-number"),
-            (["--lens", "a.lens"], "a.lens"),
             (["tidy-5", "--field", "3", "--fidelity", "draft"], "--field is for a camera with a lens, and tidy-5 has"),
             (["camera.safetensors", "--lens", "single-50mm"], "camera.safetensors has a lens of its own"),
             (["--lens", "single-50mm", "--field", "0"], "--field must be a whole number of at least 1, got 0"),
@@ -141,9 +131,6 @@ class TestPsf(BaseTester):
         ("words", "sentence"),
         [
             (["tidy-9"], "must be one of 'tidy-5', 'tidy-1'"),
-            (["missing.npy"], "no such file"),
-            (["tidy-5", "--depths", "1,far"], "--depths must be metres with commas between them, got '1,far'"),
-            (["tidy-5", "--depths", "1,-2"], "--depths must be positive metres, got '1,-2'"),
             (["tidy-5", "--depths", "nan"], "--depths must be positive metres, got 'nan'"),
             (["tidy-5", "--window", "20"], "window must be an odd number of pixels, got 20"),
             (["tidy-5", "--focus-distance", "2"], "has a lens of its own"),

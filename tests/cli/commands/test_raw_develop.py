@@ -13,7 +13,6 @@ from kornia_tidy.data.image_files import read_image
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.develop import develop
 from tests.base import BaseTester
-from tests.lab.raw.c330 import ramp
 from tests.lab.raw.dng import dng, patched
 
 
@@ -95,16 +94,6 @@ class TestRawDevelop(BaseTester):
         mean = read_image(tmp_path / "green.png").mean((1, 2))
         assert casts.argmax() == 1
         self.assert_close(mean, mean.mean().expand(3), rtol=5e-3, atol=0)
-
-    @pytest.mark.filterwarnings("default::UserWarning")
-    def test_feature_kodak_c330(self, tmp_path, capsys):
-        (tmp_path / "a.raw").write_bytes(ramp())
-        assert main(["raw", "develop", str(tmp_path / "a.raw"), "-o", str(tmp_path)]) == 0
-        told = capsys.readouterr()
-        assert "1216 x 912 px, no filter array, white balance R 1 G 1 B 1, the file's matrix" in told.out
-        assert told.err.count("\n") == 1
-        assert "is taken for a picture of a Kodak C330" in told.err
-        assert read_image(tmp_path / "a.png").shape == (3, 912, 1216)
 
     def test_feature_resume_keeps_what_is_there(self, files, tmp_path, capsys):
         good = [files[0], files[2]]

@@ -5,7 +5,7 @@ import pytest
 
 from kornia_tidy.cli import main
 from tests.base import BaseTester, shared
-from tests.lab.raw.dng import SHORT, UNDEFINED, dng
+from tests.lab.raw.dng import UNDEFINED, dng
 from tests.lab.raw.dng_kinds import gain_map
 
 
@@ -25,13 +25,6 @@ def run(command):
 
 
 class TestRawInfo(BaseTester):
-    @pytest.mark.parametrize("action", ["", "info "])
-    def test_smoke_help_teaches(self, action, capsys):
-        with pytest.raises(SystemExit) as leaving:
-            run(f"{action}--help")
-        assert leaving.value.code == 0
-        assert f"usage: kornia-tidy raw {action}" in capsys.readouterr().out
-
     def test_feature_in_words(self, folder, capsys):
         assert run("info good.dng") == 0
         assert capsys.readouterr().out.splitlines() == [
@@ -63,15 +56,6 @@ class TestRawInfo(BaseTester):
         told = capsys.readouterr()
         assert "opcodes   GainMap (optional): not applied\n" in told.out
         assert told.err.count("warning: phone.dng: its opcodes GainMap (optional) are not applied") == 1
-
-    def test_feature_floating_point_samples(self, folder, capsys):
-        counts = np.random.default_rng(0).integers(64, 1000, (36, 48))
-        extra = {258: (SHORT, [32]), 339: (SHORT, [3])}
-        data = dng(counts, black=(0,), white=1, extra=extra, blocks=[(counts / 500).astype("<f4").tobytes()])
-        (folder / "merged.dng").write_bytes(data)
-        assert run("info merged.dng") == 0
-        share = 100 * (counts >= 500).mean()
-        assert f"black 0, white 1; counts 0.128 to 1.998, {share:.3g} % of them at white" in capsys.readouterr().out
 
     @pytest.mark.filterwarnings("default::UserWarning")
     def test_feature_a_white_level_that_lies_is_told_once(self, folder, capsys):

@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import json
-import math
 
 import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.rgbd import read_rgbd
@@ -26,15 +24,6 @@ SCENE = ["raw", "simulate", "--image", "image.png", "--depth", "depth.pfm", "--f
 
 def seeded(seed):
     return torch.Generator().manual_seed(seed)
-
-
-@pytest.fixture
-def scene(tmp_path, monkeypatch):
-    image, depth = dead_leaves(72, 80, depth_range=(0.3, math.inf), num_leaves=200, seed=3)
-    write_image(tmp_path / "image.png", image)
-    write_depth(tmp_path / "depth.pfm", depth)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 class TestRawSimulate(BaseTester):

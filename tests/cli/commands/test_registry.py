@@ -135,6 +135,14 @@ def required(words, but):
 
 
 class TestMistakes(BaseTester):
+    @pytest.mark.parametrize("command", ["demo", "systems", "trade"])
+    def test_exception_without_matplotlib_comes_before_any_work(self, command, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+        assert main([command]) == 2
+        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
     @pytest.mark.parametrize(
         ("argv", "sentence"),
         [

@@ -158,14 +158,6 @@ class TestPsf(BaseTester):
             assert held == pytest.approx(100 * float(own.sum()), abs=0.06)
             assert peak == pytest.approx(100 * float(own.max()), abs=0.006)
 
-    def test_exception_lens_options(self, tmp_path, capsys):
-        saved(tmp_path / "a.safetensors", "cubic", "none", "none", "PMMA")
-        assert (
-            main(["psf", str(tmp_path / "a.safetensors"), "--focal-length", "0.035", "-o", str(tmp_path / "a.png")])
-            == 2
-        )
-        assert "a.safetensors has a lens of its own" in capsys.readouterr().err
-
 
 BANK = PSFBank.from_measured(torch.rand(1, 3, 5, 5), torch.zeros(1))
 
@@ -218,12 +210,7 @@ class TestCameraOfState(BaseTester):
         [
             (lambda: TiDyOptics(OwnFamily(1), fidelity=FIDELITY), "the masks of .* cannot be made: a OwnFamily is no"),
             (lambda: TiDyOptics(sensor=OwnSensor(), fidelity=FIDELITY), "the sensor .*: a OwnSensor is no class of"),
-            (
-                lambda: TiDyOptics(fidelity=FIDELITY).with_bank(
-                    PSFBank.from_measured(torch.rand(1, 3, 5, 5), torch.zeros(1))
-                ),
-                "measured PSFs is 'sha256",
-            ),
+            (lambda: TiDyOptics(fidelity=FIDELITY).with_bank(BANK), "measured PSFs is 'sha256"),
         ],
     )
     def test_exception_what_no_state_tells(self, change, sentence):

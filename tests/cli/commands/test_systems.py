@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import sys
-import time
-
 import pytest
 import torch
 
@@ -12,7 +9,7 @@ from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.optics.published_systems import systems_table
 from kornia_tidy.reconstruction.tasks import metres
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 
 
 class TestSystems(BaseTester):
@@ -68,26 +65,3 @@ class TestSystems(BaseTester):
         assert main(["systems", *arguments]) == 2
         assert sentence in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
-
-    def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        assert main(["systems"]) == 2
-        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
-        assert list(tmp_path.iterdir()) == []
-
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings("error")
-    def test_feature_all_nine_see_a_real_scene_within_a_minute(self, tmp_path, capsys):
-        folder = shared("data/rgbd/middlebury2014/Motorcycle", {"im0.png": 1, "disp0GT.pfm": 1})
-        files = ["--image", str(folder / "im0.png"), "--depth", str(folder / "disp0GT.pfm"), "--invalid", "inf"]
-        stereo = ["--depth-kind", "disparity", "--focal-px", "999.421", "--baseline-m", "0.193", "--doffs-px", "32.8"]
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # one thread, so that processor time does not depend on other processes
-        start = time.process_time()
-        status = main(["systems", *files, *stereo, "-o", str(tmp_path / "all.png")])
-        torch.set_num_threads(threads)
-        assert status == 0
-        assert time.process_time() - start < 60
-        told = capsys.readouterr().out
-        assert all(name in told for name in SYSTEMS)

@@ -91,10 +91,3 @@ class TestTrade(BaseTester):
         assert main(["trade", *arguments]) == 2
         assert sentence in capsys.readouterr().err
         assert list(tmp_path.iterdir()) == []
-
-    def test_exception_without_matplotlib_comes_before_any_work(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        assert main(["trade"]) == 2
-        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
-        assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import PixelwiseMask
 from kornia_tidy.lab.mask_export.frame_files import read_slm_frames, write_slm_frames
 from kornia_tidy.lab.mask_export.placement import FLIPS, ROTATIONS, PanelPlacement
 from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
@@ -215,12 +214,6 @@ class TestReadSLMFrames(BaseTester):
             return
         with pytest.raises((ValueError, FileNotFoundError), match=sentence):
             read_slm_frames(tmp_path / "slm")
-
-    def test_feature_masks_learnt_elsewhere_start_from_what_comes_back(self, tmp_path):
-        masks = PixelwiseMask(2)
-        write_slm_frames(tmp_path / "slm", SLMFrames.of(masks, GreyLevels(8)), SMALL)
-        again = PixelwiseMask(initial=read_slm_frames(tmp_path / "slm").heights())
-        assert float((again.phase - masks.phase).detach().abs().max()) <= math.pi / 256 + 1e-5
 
 
 def edit(folder, **values):

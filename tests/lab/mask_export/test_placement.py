@@ -10,10 +10,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.lab.mask_export.placement import FLIPS, ROTATIONS, PanelPlacement
-from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
-from kornia_tidy.modulator.phase_panel import GreyLevels
 from tests.base import BaseTester
 
 SIDES = st.integers(1, 9)
@@ -129,30 +126,3 @@ class TestPanelPlacement(BaseTester):
         placement = PanelPlacement((62, 70), 8e-6, radius, shift, flip, rotate)
         values = numbered(rows, columns, 2)
         assert torch.equal(placement.read(placement.place(values, 0), (rows, columns)), values)
-
-    @pytest.mark.parametrize(
-        ("flip", "rotate", "axis", "sign"),
-        [("none", 0, 1, 1), ("left-right", 0, 1, -1), ("up-down", 0, 1, 1), ("none", 90, 0, -1), ("none", 180, 1, -1)],
-    )
-    def test_convention_a_phase_that_rises_to_larger_columns_moves_the_psf_there(self, flip, rotate, axis, sign):
-        """A tilt written with any flip and rotation is read back as the same tilt."""
-        ramp = (torch.arange(23.0) * 45e-9).expand(1, 23, 23)
-        frames = SLMFrames.of(ramp, GreyLevels(8))
-        placement = PanelPlacement(flip=flip, rotate=rotate)
-        picture = placement.place(frames.grey, frames.background)[0]
-        slope = picture[100:1100, 460:1460].double().diff(dim=axis).mean()
-        assert float(slope) * sign > 0
-        assert float(picture[100:1100, 460:1460].double().diff(dim=1 - axis).abs().max()) == 0
-
-        heights = SLMFrames(
-            placement.read(picture[None], (23, 23)),
-            frames.turns,
-            frames.level_phases,
-            frames.wavelength,
-            frames.radians_per_metre,
-        ).heights()
-        lens = TiDyOptics(PixelwiseMask(initial=heights.float()), fidelity=Fidelity(window=31))
-        psf = lens.psf_bank(channels=1, defocus=[0.0]).psfs[0, 0]
-        row, column = divmod(int(psf.argmax()), 31)
-        assert row == 15
-        assert column > 15

@@ -28,11 +28,6 @@ class TestPointImages(BaseTester):
         assert image.light.shape == (3, 21 + 2 * MARGIN, 21 + 2 * MARGIN)
         assert float(image.light.sum()) == pytest.approx(float(light.sum()), rel=0.02)
 
-    def test_feature_the_background_is_taken_off(self):
-        light = spot(45, 55)
-        (plain,), (lit,) = (point_images((light + level)[None], ONCE, SENSOR, 21) for level in (0.0, 0.2))
-        self.assert_close(plain.light, lit.light, rtol=0, atol=1e-5)
-
     def test_feature_the_reference_says_where_the_chief_ray_falls(self):
         """Coded light three pixels off the chief ray: its centroid is there, that of the reference is on the ray."""
         frames, reference = spot(43, 50)[None], spot(40, 50)
