@@ -93,16 +93,3 @@ class TestAddresses(BaseTester):
         (address,) = addresses("p.md", text)
         with pytest.raises(AssertionError, match=match):
             check(address)
-
-    @pytest.mark.parametrize(
-        "text",
-        [
-            "open http://127.0.0.1:7860/ or http://localhost:7860",
-            "[file](docs/start.md#one), kornia_tidy.data, a/b",
-            "see [the paper](https://arxiv.org/abs/2303.17583).",
-            "[versions](https://semver.org/) are [counted](docs/start.md)",
-        ],
-    )
-    def test_feature_good_ones_pass(self, text):
-        for address in addresses("p.md", text):
-            check(address)

@@ -45,12 +45,6 @@ class TestBenchmarks(BaseTester):
         document = read_benchmarks(written)
         assert {entry["group"] for entry in document["benchmarks"]} == SUITES
 
-    def test_feature_where_light_propagates_the_pupils_samples_are_told(self, written):
-        for entry in read_benchmarks(written)["benchmarks"]:
-            if entry["group"] in {"capture", "psf_bank"}:
-                facts = entry["extra_info"]
-                assert min(facts[name] for name in ("masks", "layers", "window", "wavelengths", "pupil")) > 0
-
     def test_feature_the_table_has_a_line_for_each(self, written):
         document = read_benchmarks(written)
         lines = markdown(document).splitlines()[2:]

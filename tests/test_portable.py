@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import pytest
 
 from tests import portable
 from tests.base import BaseTester
-from tests.portable import AVX512, FACTORS, Factor, Machine, Outcome, main
+from tests.portable import FACTORS, Factor, Machine, Outcome, main
 
 PLAIN = Machine("a processor", portable.V2, {"aten": "DEFAULT", "mkl": "0"})
 USED = {"aten": "DEFAULT", "mkl": "1", "compiled": True, "threads": 1}
@@ -52,28 +51,6 @@ class TestPortable(BaseTester):
         if reason:
             assert re.search(reason, str(outcome))
 
-    def test_feature_what_a_machine_does_not_heed_is_said(self, probed):
-        probed["mkl"] = PLAIN.usual["mkl"]
-        assert "to the last bit as without it on this processor (a processor)" in str(
-            portable.why_not(factor("onemkl compatible"), PLAIN)
-        )
-        machine = replace(PLAIN, can=AVX512)
-        assert portable.why_not(factor("aten avx512"), machine) == "PyTorch uses DEFAULT nevertheless"
-
-    def test_feature_what_is_no_change_is_left_to_the_usual_tests(self, probed):
-        machine = replace(PLAIN, usual=dict(probed))
-        assert portable.why_not(factor("threads 1"), machine) == "it is what `make test` runs on this machine"
-        probed["compiler"] = "another"
-        assert portable.why_not(factor("threads 1"), machine) is None
-
-    def test_feature_reports_are_added_up(self):
-        report = portable.ET.fromstring(
-            '<testsuites><testsuite tests="7" failures="1" errors="1" skipped="2"/></testsuites>'
-        )
-        outcome = Outcome("one")
-        portable.count(outcome, report)
-        assert (outcome.tests, outcome.passed, outcome.failed, outcome.skipped) == (7, 3, 2, 2)
-
     @pytest.mark.usefixtures("probed")
     def test_feature_the_table_has_what_was_run_and_what_was_not(self, monkeypatch, capsys):
         def run(factor, machine, tests):
@@ -86,17 +63,6 @@ class TestPortable(BaseTester):
         for name in ("aten default", "aten avx2", "aten avx512", "threads 1", "threads 2"):
             assert f"| {name} | 2 | 1 |" in told
         assert "onemkl" not in told
-
-    def test_feature_listing_runs_nothing(self, capsys, monkeypatch):
-        monkeypatch.setattr(portable, "this_machine", lambda: pytest.fail("looked at the machine"))
-        assert main(["--list"]) == 0
-        told = capsys.readouterr().out
-        assert all(f.name in told for f in FACTORS)
-
-    def test_exception_a_name_that_is_none(self, capsys):
-        with pytest.raises(SystemExit):
-            main(["--only", "arm"])
-        assert "no factor's name begins with 'arm': there are aten default," in capsys.readouterr().err
 
     def test_feature_only_the_factor_differs(self, monkeypatch):
         monkeypatch.setenv("CC", "mine")

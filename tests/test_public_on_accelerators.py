@@ -12,15 +12,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.data.dead_leaves import DeadLeaves
-from kornia_tidy.reconstruction import (
-    JointHead,
-    Refocused,
-    Residual,
-    losses,
-    metrics,
-)
-from kornia_tidy.reconstruction.nafnet import NAFNet
+from kornia_tidy.data import DeadLeaves
+from kornia_tidy.reconstruction import JointHead, NAFNet, Refocused, Residual, losses, metrics
 from kornia_tidy.training.coded_datasets import CodedCaptures, render_scenes
 from tests.base import BaseTester
 from tests.operations import OPERATIONS, bank_for

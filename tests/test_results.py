@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import json
 import math
-import shutil
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from scipy import stats
 from torch import nn
 
 from kornia_tidy.design.candidates import FLAT as FLAT_LENS
-from kornia_tidy.reconstruction import self_ensemble
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.hub import save_pretrained
 from kornia_tidy.reconstruction.pretrained import load_pretrained
@@ -29,9 +26,9 @@ from tests.benchmarks.results import measure
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
 from tests.benchmarks.results.report import page
-from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK, bilateral, restorations_for
+from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK, restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
-from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, perceptual_distance, ramp, score
+from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, ramp, score
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
 from tests.benchmarks.results.systems import WINDOW, System, available, from_checkpoint, of_trained
 from tests.benchmarks.results.table import Key, Results, paired
@@ -75,9 +72,6 @@ class TestHalves(BaseTester):
         assert first == sorted(names[index] for index in order[:18])
         assert sorted(first + second) == names
 
-    def test_feature_one_scene_is_of_half_a(self):
-        assert halves(["only"]) == (["only"], [])
-
 
 class TestNoise(BaseTester):
     def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
@@ -96,10 +90,6 @@ class TestNoise(BaseTester):
         assert torch.equal(taken[0].light, taken[1].light)
         assert not torch.equal(taken[0].light, capture(taken[0].system, scene, scene.image, "0.002").light)
 
-    def test_exception_no_noise_of_this_name(self):
-        with pytest.raises(ValueError, match="could not convert"):
-            sensor_of("bright", 17.6)
-
 
 class TestSystems(BaseTester):
     def test_feature_kinds_are_told_from_the_masks(self):
@@ -112,22 +102,6 @@ class TestSystems(BaseTester):
         assert bank.window == WINDOW == 129
         self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
 
-    def test_feature_captures_with_occlusion_differ_where_depth_steps_and_there_alone(self):
-        plain, occluded = (available()[f"edof-flat{words}"]() for words in ("", " with occlusion"))
-        assert (occluded.kind, occluded.title) == ("with occlusion", "flat lens, with occlusion, f/48")
-        left, near = torch.arange(80) < 40, torch.full((1, 1, 80, 80), 0.35)
-        image = left.float().expand(1, 3, 80, 80)  # a white object before a black ground
-        with torch.no_grad():
-            even, edge = (
-                plain.optics(image, depth) - occluded.optics(image, depth)
-                for depth in (near, torch.where(left, near, torch.inf))
-            )
-        assert even.abs().max() < 2e-5  # float32's rounding, as in the tests of occlusion
-        assert edge[..., 38:42].abs().max() > 0.01  # 500 times the rounding
-
-    def test_feature_flat_lenses_have_their_f_number(self):
-        assert available()["flat f/22"]().f_number == pytest.approx(22.0)
-
     def test_feature_other_weights_are_another_system(self):
         makers = available()
         assert makers[FLAT]().digest == makers[FLAT]().digest != makers["flat f/60"]().digest
@@ -136,13 +110,6 @@ class TestSystems(BaseTester):
         with torch.no_grad():
             next(trained.head.parameters()).add_(1.0)
         assert of_trained("a", trained).digest != before
-
-    def test_feature_a_checkpoint_is_named_as_its_folder(self, tmp_path):
-        from kornia_tidy.reconstruction.pretrained import FOLDER
-
-        (tmp_path / "mine").mkdir()
-        shutil.copy(FOLDER / "edof-1.safetensors", tmp_path / "mine" / "best.safetensors")
-        assert from_checkpoint(tmp_path / "mine" / "best.safetensors").name == "mine"
 
     def test_feature_a_folder_with_its_own_aperture_and_without_masks(self, tmp_path):
         settings = SystemSettings(masks=1, start="flat", f_number=48.0, window=9, head="plain", width=2)
@@ -165,9 +132,6 @@ class TestSearch(BaseTester):
 
         assert search(value, GRID, {"a": 1.5, "b": 1.0}) == {"a": 64.0, "b": 9.0}
         assert len(asked) == len(set(asked)) < len(GRID["a"]) * len(GRID["b"])
-
-    def test_feature_ends_at_an_edge(self):
-        assert search(lambda s: -s["a"] - s["b"], GRID, {"a": 100.0, "b": 5.0}) == {"a": 1.0, "b": 1.0}
 
 
 class TestRestorations(BaseTester):
@@ -192,19 +156,6 @@ class TestRestorations(BaseTester):
         electrons = 10000 * (17.6 / 50) ** 2
         self.assert_close(told[3].square(), taken.light / electrons + (2.4 / electrons) ** 2)
         self.assert_close(told[4], told[3] / 2)
-
-    def test_feature_networks_behind_a_closed_form_are_averaged_over_orientations(self):
-        system = available()[FIVE]()
-        taken = capture(system, dead_leaves(1, 32).load("leaves 00"), torch.rand(1, 3, 32, 32), "0.01")
-        found = restorations_for(system)
-        with torch.inference_mode():
-            alone, averaged = (found[name].restore(taken, {})["image"] for name in (NETWORK, ENSEMBLE))
-            expected = self_ensemble(system.head)(taken.image, noise=taken.noise).clamp(0, 1)
-        self.assert_close(averaged, expected)
-        assert (averaged - alone).abs().max() > 1e-3
-
-    def test_feature_a_lens_without_a_network_has_no_wrong_levels(self):
-        assert not any(NETWORK in name for name in restorations_for(available()[FLAT]()))
 
     def test_feature_tikhonov_undoes_a_flat_lens(self):
         system, scene = available()[FLAT](), dead_leaves(1, 72).load("leaves 00")
@@ -232,13 +183,6 @@ class TestRestorations(BaseTester):
                 errors.append((found.restore(taken, {"weight": 1e-3})["image"] - scene.image).square().mean().item())
         assert errors[0] < 0.8 * min(errors[1:])
         assert BY_DEPTH not in restorations_for(flat)
-
-    def test_feature_bilateral_smooths_noise_and_keeps_edges(self):
-        noise = 0.02 * torch.randn(1, 3, 40, 40)
-        step = (0.25 + 0.5 * (torch.arange(40) >= 20).float()).expand(1, 3, 40, 40)
-        smooth = bilateral(step + noise, 0.2, 2.0)
-        assert (smooth - step).std() < 0.5 * noise.std()
-        assert (smooth[..., 20] - smooth[..., 19]).mean() > 0.45
 
 
 class TestScores(BaseTester):
@@ -290,17 +234,6 @@ class TestScores(BaseTester):
         top, bottom = best_ramp([self.scene(holes, known=known)])
         assert (top, bottom) == (pytest.approx(0.2), pytest.approx(0.7))
         self.assert_close(ramp(self.scene(holes, known=known), top, bottom), depth)
-
-    def test_feature_scenes_of_a_common_ramp_weigh_the_same(self):
-        low, high = torch.zeros(1, 1, 8, 4), torch.ones(1, 1, 8, 400)
-        assert best_ramp([self.scene(low), self.scene(high)]) == (pytest.approx(0.5), pytest.approx(0.5))
-
-    def test_feature_lpips_is_left_out_where_its_weights_are_missing(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-        monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)  # as if torchvision were installed
-        perceptual_distance.cache_clear()
-        assert perceptual_distance() is None
-        perceptual_distance.cache_clear()
 
 
 class TestPaired(BaseTester):
@@ -408,9 +341,6 @@ class TestResults(BaseTester):
         with pytest.raises(ValueError, match=r"is a design for 2 electrons at f/17.6, not measured"):
             recommendations([tmp_path / "500"])
 
-    def test_feature_without_results_nothing_is_met(self):
-        assert {row.met for row in verdicts(synthetic({}, [real_like()]))} == {None}
-
 
 class TestStore(BaseTester):
     CELL = Cell("real", "a", "flat", "00ff", "0.01", "capture", "")
@@ -490,11 +420,6 @@ class TestCommand(BaseTester):
         command.main([str(quick), "--quick"])
         assert (quick / "results.csv").read_bytes() == before
 
-    def test_feature_the_page_goes_to_another_place(self, quick, tmp_path):
-        command.main([str(quick), "--quick", "--report", "--page", str(tmp_path / "page.md")])
-        assert (tmp_path / "page.md").read_text() == (quick / "results.md").read_text()
-        assert (tmp_path / "images" / "results.png").is_file()
-
     @pytest.mark.parametrize(
         ("arguments", "match"),
         [
@@ -505,14 +430,6 @@ class TestCommand(BaseTester):
     def test_exception_one_sentence(self, arguments, match, tmp_path):
         with pytest.raises(SystemExit, match=match):
             command.main([str(tmp_path), *arguments])
-
-    def test_feature_the_page_of_networks_alone_compares_with_the_best(self):
-        scenes = real_like()
-        scores = {("57000e", FLAT, NETWORK): scored(scenes, 25.0), ("57000e", FIVE, NETWORK): scored(scenes, 26.5)}
-        cell = Measured(Cell(REAL, "s0", FIVE, "", "57000e", NETWORK, ""), {"psnr": 26.5}, HERE)
-        text = page(synthetic(scores, [scenes]), [cell])
-        assert f"is the difference to *{NETWORK}* of `{FIVE}`." in text
-        assert "| -1.50 ± 0.00 |" in text
 
     def test_feature_the_page_says_what_is_missing(self):
         cell = Measured(Cell(REAL, "s0", FLAT, "", "0.01", "capture", ""), {"psnr": 20.0}, HERE)
@@ -538,10 +455,6 @@ class TestDepthUncertainty(BaseTester):
         assert 0 < textured < 0.4
         assert 0 < float(cells[5]) < 0.4
         assert cells[6].endswith(" %")
-
-    def test_exception_a_network_that_does_not_tell_is_named(self):
-        with pytest.raises(ValueError, match="edof-1 does not tell how sure"):
-            depth_uncertainty.row(available()["edof-1"](), FIXED[0])
 
     def test_feature_variances_of_a_fitted_temperature_are_as_large_as_squared_errors(self):
         generator = torch.Generator().manual_seed(0)

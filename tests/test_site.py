@@ -90,16 +90,6 @@ class TestGallery(BaseTester):
         self.make(tmp_path, example("(1, 2)"))
         assert "examples/my_example.py" in capsys.readouterr().out
 
-    def test_feature_without_a_run_the_page_says_how_to_get_one(self, tmp_path, example):
-        page = self.make(tmp_path, example("1 / 0"), run=False)
-        assert "Pictures and numbers are made by `make docs`." in page
-        assert "What it prints" not in page
-
-    def test_exception_an_example_that_fails_ends_the_build(self, tmp_path, example):
-        with pytest.raises(RuntimeError, match=r"examples/my_example\.py failed:\n(.|\n)*ZeroDivisionError"):
-            self.make(tmp_path, example("1 / 0"))
-        assert not (tmp_path / "results" / "my_example" / "made_of.txt").exists()
-
     def test_feature_titles_and_arguments_are_of_examples_that_are_there(self):
         there = {path.stem for path in (SITE.parents[1] / "examples").glob("*.py")}
         assert set(gallery.TITLES) == there
@@ -178,33 +168,6 @@ class TestFlowChart(BaseTester):
         assert len(ends) == len(chart.arrows)
         assert all(float(end[-1]) > float(end[1]) for end in ends)
 
-    def test_feature_long_arrows_pass_beside_the_boxes(self):
-        chart = flowchart.read_chart("flowchart TD\n  a --> b\n  b --> c\n  a --> c")
-        layers, stations = flowchart.layout(chart)
-        assert [set(layer) for layer in layers] == [{"a"}, {"b", ("a", "c", 1)}, {"c"}]
-        assert stations["a", "c"] == ["a", ("a", "c", 1), "c"]
-
-    def test_feature_words_lines_and_dots(self):
-        svg = flowchart.draw_chart('flowchart LR\n  a["one<br/>1 < 2"] -. against .-> b[two]')
-        assert re.findall(r">([^<>]+)</text>", svg) == ["one", "1 &lt; 2", "two"]
-        assert svg.count("stroke-dasharray") == 1
-
-    def test_feature_places_in_order_and_near_what_is_wanted(self):
-        assert flowchart.separated([0.0, 0.0], [10.0, 10.0]) == [-16.0, 16.0]
-        assert flowchart.separated([0.0, 100.0], [10.0, 10.0]) == [0.0, 100.0]
-
-    @pytest.mark.parametrize(
-        ("text", "match"),
-        [
-            ("graph TD\n  a --> b", "must begin with flowchart TD or flowchart LR, got 'graph TD'"),
-            ("flowchart TD\n  a ==> b", "must be an arrow between boxes, got 'a ==> b'"),
-            ("flowchart TD\n  a --> b\n  b --> a", "must not go in a circle"),
-        ],
-    )
-    def test_exception_what_is_not_understood(self, text, match):
-        with pytest.raises(ValueError, match=match):
-            flowchart.draw_chart(text)
-
 
 class TestFormulas(BaseTester):
     def test_feature_commands_become_signs_and_unknown_ones_are_told(self, monkeypatch):
@@ -239,16 +202,6 @@ class TestDocstrings(BaseTester):
         conf.keep_sentences_of_properties(None, "function", "height", None, None, lines)
         assert len(lines) == 2
 
-    def test_feature_a_default_that_is_made_anew_becomes_an_ellipsis(self, conf):
-        shorten = conf.shorten_factories
-        assert shorten(None, "", "", None, None, "(a=<factory>, b=1)", "int") == ("(a=..., b=1)", "int")
-        assert shorten(None, "", "", None, None, None, None) == (None, None)
-
-    def test_feature_links_to_examples_lead_to_the_gallery(self, conf):
-        source = ["see [a](../examples/motion_blur.py), [b](examples/start.ipynb)"]
-        conf.link_examples_to_the_gallery(None, "page", source)
-        assert source == ["see [a](../gallery/motion_blur.md), [b](examples/start.ipynb)"]
-
     @pytest.mark.parametrize(
         ("target", "full"),
         [
@@ -260,7 +213,3 @@ class TestDocstrings(BaseTester):
     )
     def test_feature_references_have_one_full_name(self, conf, target, full):
         assert conf.references.full_names(target) == full
-
-    @pytest.mark.parametrize(("target", "there"), [("Tensor", True), ("nn.Module", True), ("Gone", False)])
-    def test_feature_names_of_other_packages_must_exist(self, conf, target, there):
-        assert conf.references.exists(target, None) is there

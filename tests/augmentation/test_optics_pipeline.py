@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.augmentation import OpticsPipeline, RandomTiDyOptics, SceneGeometry
-from kornia_tidy.optics import Spectrum
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kornia_tidy.data.calibration_files import read_calibration
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 
 # The evaluation sets have blanks where the full ones have none.
 TEXT = " cam0=[ 1038.018 0 322.037 ; 0 1038.018 243.393 ; 0 0 1 ] \ncam1=[1 0 2; 0 1 2; 0 0 1]\n doffs= 53.271 \n"
@@ -40,10 +40,3 @@ class TestReadCalibration(BaseTester):
         (tmp_path / name).write_text(text)
         with pytest.raises(ValueError, match=rf"cannot read .*{name}: .*{sentence}"):
             read_calibration(tmp_path / name)
-
-    def test_feature_real_files(self):
-        files = sorted(shared("data/rgbd/middlebury2014", {"*/calib.txt": 6}).glob("*/calib.txt"))
-        for file in files:
-            found = read_calibration(file)
-            assert 0.05 < found["baseline_m"] < 0.4
-            assert 400 < found["focal_px"] < 2000

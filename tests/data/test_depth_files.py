@@ -160,10 +160,6 @@ class TestWriteDepth(BaseTester):
             write_depth(tmp_path / "a.png", torch.full((1, 2, 2), 1.5), 1000, saturate=True)
         assert not (tmp_path / "a.png").exists()
 
-    def test_exception_scale_is_not_positive(self, tmp_path):
-        with pytest.raises(ValueError, match="scale must be positive and finite metres, got 0"):
-            write_depth(tmp_path / "a.png", torch.ones(1, 2, 2), scale=0)
-
     def test_convention_top_row_stays_on_top(self, tmp_path):
         depth = torch.tensor([[[1.0], [2.0], [math.pi]]])
         write_depth(tmp_path / "a.pfm", depth)

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from kornia_tidy.data import read_depth, read_image, read_rgbd, write_image
+from kornia_tidy.data import read_depth, read_image
 from kornia_tidy.data.exr import decode_exr
 from tests.base import BaseTester
 
@@ -163,12 +163,6 @@ class TestDecodeExr(BaseTester):
         with pytest.raises(ValueError, match=r"holds \(37, 53\) pixels of a display window of \(10000, 10000\)"):
             decode_exr(data)
 
-    def test_exception_jpeg_2000(self, library):
-        if not hasattr(library, "HTJ2K32_COMPRESSION"):
-            pytest.skip("this OpenEXR has no compression by JPEG 2000")
-        with pytest.raises(ValueError, match="compressed by JPEG 2000"):
-            decode_exr(exr(library, {"Z": DEPTH}, compression=library.HTJ2K32_COMPRESSION))
-
     def test_exception_tiles_that_the_file_cannot_hold(self, library):
         data = exr(library, {"Z": DEPTH}, type=library.tiledimage, tiles=library.TileDescription())
         place = data.index(b"tiledesc\0") + len(b"tiledesc\0") + 4
@@ -193,10 +187,3 @@ class TestDecodeExr(BaseTester):
         (tmp_path / "a.exr").write_bytes(b"v/1\x01" + bytes(99))
         with pytest.raises(ImportError, match=r"pip install 'kornia-tidy\[exr\]'"):
             read_depth(tmp_path / "a.exr")
-
-    def test_feature_a_scene(self, library, tmp_path):
-        import torch
-
-        write_image(tmp_path / "a.png", torch.rand(3, H, W))
-        (tmp_path / "a.exr").write_bytes(exr(library, LAYERS["Blender's layers"]))
-        np.testing.assert_array_equal(read_rgbd(tmp_path / "a.png", tmp_path / "a.exr").depth[0], DEPTH)

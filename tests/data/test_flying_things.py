@@ -82,14 +82,6 @@ class TestFlyingThings3D(BaseTester):
         sample = FlyingThings3D(tmp_path, subsets="A", frames=frames)[0]
         self.assert_close(sample["image"][0], 8 * 1050 / sample["depth"][0] / 255)
 
-    def test_feature_files_that_systems_leave_are_no_frames(self, tmp_path):
-        write_flying_things(tmp_path, {"TRAIN/A": 1})
-        folder = tmp_path / "frames_cleanpass/TRAIN/A"
-        (folder / ".DS_Store").touch()
-        (folder / "0000/left/._0006.png").touch()
-        (folder / "0000/left/Thumbs.db").touch()
-        assert len(FlyingThings3D(tmp_path, subsets="A")) == 2
-
     def test_exception_missing_data_say_what_to_download(self, tmp_path):
         message = r"download 'RGB images \(finalpass\)'.* and 'Disparity' .* https://lmb.*finalpass/TRAIN/A/0000/left"
         with pytest.raises(FileNotFoundError, match=message):

@@ -13,7 +13,7 @@ import torch
 
 from kornia_tidy.data import NYUDepthV2, UnreadableItemError
 from tests.base import BaseTester, shared
-from tests.data.published import HEADER_7_3, write_nyu
+from tests.data.published import write_nyu
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,6 @@ def copy(published, tmp_path):
 
 
 class TestNYUDepthV2(BaseTester):
-    def test_smoke_the_fixture_is_a_matlab_file(self, published):
-        data = (published[0] / "nyu_depth_v2_labeled.mat").read_bytes()
-        assert data.startswith(HEADER_7_3)
-        assert data[124:128] == b"\x00\x02IM"
-        assert data[512:].startswith(b"\x89HDF\r\n\x1a\n")
-
     @pytest.mark.parametrize(("split", "numbers"), [("train", [2, 4]), ("test", [1, 3, 5]), ("all", [1, 2, 3, 4, 5])])
     def test_feature_split_is_the_official_one_and_counts_from_one(self, published, split, numbers):
         root, images, _, _ = published
@@ -116,11 +110,6 @@ class TestNYUDepthV2(BaseTester):
         (tmp_path / "mine.txt").write_text("1\n6")
         with pytest.raises(ValueError, match=r"names frame 6, and .* has frames 1 to 5"):
             NYUDepthV2(published[0], tmp_path / "mine.txt")
-
-    def test_exception_damaged_split(self, copy):
-        (copy / "splits.mat").write_bytes(b"no matlab")
-        with pytest.raises(ValueError, match=r"cannot read .*splits\.mat: it should hold trainNdxs"):
-            NYUDepthV2(copy, "train")
 
     @pytest.mark.parametrize("kept", [100, 300_000])
     def test_exception_cut_short(self, copy, kept):

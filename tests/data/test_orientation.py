@@ -8,15 +8,13 @@ import struct
 import warnings
 import zlib
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageOps
 
-from kornia_tidy.data import read_depth, read_image, read_rgbd, write_depth
+from kornia_tidy.data import PhotoCollages, read_depth, read_image, read_rgbd, write_depth
 from kornia_tidy.data.orientation import orientation_of
-from kornia_tidy.data.photo_collages import PhotoCollages
 from tests.base import BaseTester
 
 SIZES = [(24, 32), (24, 24)]  # rows and columns; a square picture fits in any orientation
@@ -170,10 +168,3 @@ class TestOrientation(BaseTester):
             ),
         ):
             read_rgbd(tmp_path / "a.jpg", tmp_path / "d.pfm", resample=resample)
-
-    def test_feature_opencv_turns_what_is_read_as_stored(self, tmp_path):
-        path = tmp_path / "a.jpg"
-        path.write_bytes(encoded("JPEG", exif=b"Exif\0\0" + exif(6)))
-        with pytest.warns(UserWarning, match="orientation 6"):
-            stored = read_image(path)[0].numpy()
-        np.testing.assert_allclose(np.rot90(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)), stored * 255, atol=1e-3)

@@ -28,10 +28,6 @@ class TestDecodePfm(BaseTester):
         np.testing.assert_array_equal(values, TOP_DOWN)
         assert values.dtype.isnative
 
-    def test_feature_colour_has_three_channels(self):
-        values = decode_pfm(b"PF\n1 2\n-1.0\n" + struct.pack("<6f", 1, 2, 3, 4, 5, 6))
-        assert values.tolist() == [[[4, 5, 6]], [[1, 2, 3]]]
-
     @pytest.mark.parametrize("shape", [(5, 7), (1, 1), (4, 3, 3)])
     def test_feature_opencv_and_this_library_read_each_other(self, shape, tmp_path):
         """At scale 1 OpenCV's reader is right; its channels are B, G, R."""
@@ -67,9 +63,3 @@ class TestDecodePfm(BaseTester):
         values = decode_pfm(shared("data/rgbd/flyingthings3d_subset/disparity/0000/left/0012.pfm").read_bytes())
         assert values.shape == (540, 960)
         assert values[-1, 0] == struct.unpack("<f", b"\xa3\xcd\x1f\x42")[0]
-
-    def test_feature_middlebury_values_are_not_multiplied_by_the_scale(self):
-        """The bottom left corner of ArtL is 00 00 5c 42 = 55 px."""
-        values = decode_pfm(shared("data/rgbd/middlebury2014/ArtL/disp0GT.pfm").read_bytes())
-        assert values.shape == (277, 347)
-        assert values[-1, 0] == 55

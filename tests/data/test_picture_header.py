@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kornia_tidy.data import image_files
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data import image_files, read_image
 from kornia_tidy.data.picture_header import LARGEST, VARIABLE, check_header, check_pixels
 from tests.base import BaseTester
 from tests.forks import fork, wait

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy.data import RGBDFolder, UnreadableItemError, described_folder
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 from tests.data.published import write_pfm
 
 
@@ -40,12 +40,6 @@ class TestRGBDFolder(BaseTester):
         for index, sample in enumerate(data):
             self.assert_close(sample["image"][:, 0, 0], torch.tensor([0.2, 0.2, 1.0]))
             assert torch.equal(sample["depth"], torch.full((1, 4, 6), index + 1.0))
-
-    def test_feature_names_are_sorted_as_text(self, tmp_path):
-        for number in (2, 10, 1):
-            write(tmp_path, f"s{number}.png", f"s{number}_depth.png", 1000)
-        data = RGBDFolder(tmp_path, "*.png", "*_depth.png", scale=0.001)
-        assert [data.name(index) for index in range(len(data))] == ["s1", "s10", "s2"]
 
     def test_feature_several_stars_must_all_agree(self, tmp_path):
         for scene, frame, millimetres in (("b", "0", 1), ("a", "1", 2), ("a", "0", 3)):
@@ -87,12 +81,6 @@ class TestRGBDFolder(BaseTester):
         with pytest.raises(ValueError, match="resample must be one of"):
             RGBDFolder(tmp_path, *patterns, resample="area")
 
-    def test_feature_grey_pictures_get_three_channels(self, tmp_path):
-        write(tmp_path, "x.png", "x_depth.png", 500)
-        cv2.imwrite(str(tmp_path / "x.png"), np.full((4, 6), 51, np.uint8))
-        image = RGBDFolder(tmp_path, "*.png", "*_depth.png", scale=0.001)[0]["image"]
-        self.assert_close(image, torch.full((3, 4, 6), 0.2))
-
     def test_exception_files_without_a_partner_are_named(self, tmp_path):
         for name in ("a", "b", "c", "d", "e"):
             write(tmp_path, f"rgb/{name}.png", f"depth/{name}.png", 1)
@@ -129,34 +117,12 @@ class TestRGBDFolder(BaseTester):
         with pytest.raises(ValueError, match=r"must have a \* and equally many"):
             RGBDFolder(tmp_path, image, depth)
 
-    def test_exception_options_are_checked_before_any_file(self, tmp_path):
-        with pytest.raises(ValueError, match="focal_px and baseline_m are needed"):
-            RGBDFolder(tmp_path, "*.png", "*.pfm", kind="disparity", invalid=[0])
-        with pytest.raises(TypeError, match="focal"):
-            RGBDFolder(tmp_path, "*.png", "*.pfm", focal=3.0)
-
     def test_exception_sizes_that_differ_are_an_unreadable_item(self, tmp_path):
         write(tmp_path, "x.png", "x_depth.png", 1)
         write(tmp_path, "unused.png", "x_depth.png", 1, size=(6, 4))
         (tmp_path / "unused.png").unlink()
         with pytest.raises(UnreadableItemError, match=r"item 0 of RGBDFolder, x: .* must have the same size"):
             RGBDFolder(tmp_path, "*.png", "*_depth.png")[0]
-
-    @pytest.mark.parametrize(
-        ("folder", "image", "depth", "count", "median"),
-        [
-            ("7scenes", "*.color.jpg", "*.depth.png", 3, 1.7),
-            ("icl_nuim_o3d", "image_*.jpg", "depth_*.png", 3, 1.8),
-            ("open3d/RGBD", "color/*.jpg", "depth/*.png", 5, 1.7),
-        ],
-    )
-    def test_feature_real_folders(self, folder, image, depth, count, median):
-        root = shared(f"data/rgbd/{folder}", {image: count, depth: count})
-        data = RGBDFolder(root, image, depth, scale=0.001, invalid=[65535])
-        assert len(data) == count
-        for sample in data:
-            assert sample["image"].shape == (3, 480, 640)
-            assert sample["depth"][sample["mask"]].median().item() == pytest.approx(median, rel=0.3)
 
 
 class TestDescribedFolder(BaseTester):

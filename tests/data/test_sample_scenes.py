@@ -38,11 +38,6 @@ class TestSampleScene(BaseTester):
         left, right = (image[:, 415:435, columns].mean() for columns in (slice(100, 130), slice(285, 315)))
         assert float(right) < 0.8 * float(left)
 
-    @pytest.mark.parametrize("name", SCENES)
-    def test_feature_has_another_size(self, name):
-        image, depth, _ = sample_scene(name, 12)
-        assert (image.shape, depth.shape) == ((3, 12, 16), (1, 12, 16))
-
     @pytest.mark.parametrize("height", [0, 2.5])
     def test_exception_height(self, height):
         with pytest.raises(ValueError, match=f"height must be a positive integer, got {height}"):

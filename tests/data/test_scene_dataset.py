@@ -96,10 +96,6 @@ class TestEveryDataSet(BaseTester):
         assert torch.equal(first["depth"], again["depth"])
         assert (first["index"], first["name"]) == (again["index"], again["name"])
 
-    def test_feature_items_differ(self, data, kind):
-        images = torch.stack([sample["image"] for sample in data[kind]])
-        assert len(images.unique(dim=0)) == len(images)
-
     @pytest.mark.parametrize("beyond", [0, 5])
     def test_exception_index(self, data, kind, beyond):
         length = len(data[kind])
@@ -156,9 +152,6 @@ class TestSceneDataset(BaseTester):
         with pytest.raises(ValueError, match=r"^not this one$") as caught:
             Stub(transform=refuse)[0]
         assert not isinstance(caught.value, UnreadableItemError)
-
-    def test_feature_grey_is_repeated(self):
-        assert torch.equal(Stub()[0]["image"], torch.full((3, 4, 5), 0.5))
 
     @pytest.mark.parametrize("index", [torch.tensor(0), -2, False])
     def test_feature_whatever_is_an_index_will_do(self, index):

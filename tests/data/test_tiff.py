@@ -140,10 +140,6 @@ class TestReadsWhatIsStored(BaseTester):
         coded = lzw(RGB.tobytes(), old=True)
         assert np.array_equal(decoded(tiff(Page(RGB, photometric=2, compression=5, segments=[coded]))).values, RGB)
 
-    def test_feature_lengths_of_strips_that_are_not_given(self):
-        page = Page(RGB, photometric=2, compression=8, fields={279: None})
-        assert np.array_equal(decoded(tiff(page)).values, RGB)
-
     def test_feature_one_number_of_bits_for_all_samples(self):
         page = Page(RGB, photometric=2, fields={258: (3, [8]), 339: None})
         assert np.array_equal(decoded(tiff(page)).values, RGB)
@@ -160,12 +156,6 @@ class TestReadsWhatIsStored(BaseTester):
         found = decoded(tiff(Page(RGB, photometric=2, fields={274: (3, [orientation])})))
         assert np.array_equal(found.values, RGB)
         assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
-
-    def test_feature_a_turned_picture_is_told(self, tmp_path):
-        (tmp_path / "a.tif").write_bytes(tiff(Page(RGB, photometric=2, fields={274: (3, [3])})))
-        with pytest.warns(UserWarning, match=r"a.tif is stored rotated by 180 degrees \(orientation 3\)"):
-            image = read_image(tmp_path / "a.tif")
-        assert np.array_equal((image * 255).round().byte().numpy().transpose(1, 2, 0), RGB)
 
     def test_feature_metadata_of_microscopes_are_not_looked_at(self, capfd):
         """LSM, NDPI, ImageJ, STK of one plane, OME with another file, ScanImage, Philips, SIS: tifffile parses them."""

@@ -13,14 +13,11 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.data import write_depth, write_image
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy import PixelwiseMask, PSFBank, TiDyOptics
+from kornia_tidy.data import dead_leaves, write_depth, write_image
 from kornia_tidy.data.pfm import encode_pfm
-from kornia_tidy.lab.mask_export import SLMFrames, write_slm_frames
-from kornia_tidy.lab.mask_export.mask_files import write_heights
-from kornia_tidy.modulator.phase_panel import GreyLevels
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.lab.mask_export import SLMFrames, write_heights, write_slm_frames
+from kornia_tidy.modulator import GreyLevels
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import build_head, build_optics
 from kornia_tidy.training.settings import TrainingSettings

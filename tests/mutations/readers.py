@@ -13,32 +13,28 @@ import numpy as np
 import torch
 from PIL import Image
 
-from kornia_tidy import TiDyOptics
-from kornia_tidy.data import NYUDepthV2, TUMSequence, read_depth, read_image
+from kornia_tidy import PSFBank, TiDyOptics
+from kornia_tidy.data import DeadLeaves, NYUDepthV2, TUMSequence, described_folder, read_depth, read_image
 from kornia_tidy.data.calibration_files import read_calibration
-from kornia_tidy.data.dead_leaves import DeadLeaves
 from kornia_tidy.data.picture_header import check_header
-from kornia_tidy.data.rgbd_folder import described_folder
 from kornia_tidy.figures.learning_curve import draw_learning_curve
-from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
+from kornia_tidy.lab.calibration.noise import PhotonTransfer
+from kornia_tidy.lab.calibration.noise.photon_transfer import TransferLine, write_json
 from kornia_tidy.lab.calibration.noise.photon_transfer import read_json as read_noise
 from kornia_tidy.lab.calibration.noise.transfer_curve import CurvePoint
-from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs, PointReport
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
 from kornia_tidy.lab.mask_export import read_heights, read_response, read_slm_frames
-from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
 from kornia_tidy.lab.raw.tags import camera_tags, kodak_matrix, tiff_directories
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction import load_midas_small
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
-from kornia_tidy.reconstruction.midas_small import load_midas_small
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state
 from kornia_tidy.reconstruction.trained import load_camera, load_trained
 from kornia_tidy.training.callbacks import drop_rows_after
-from kornia_tidy.training.coded_datasets import CodedCaptures, render_scenes
+from kornia_tidy.training.coded_datasets import CodedCaptures, Layout, decode_sample, render_scenes
 from kornia_tidy.training.coded_datasets.index import encode_index
-from kornia_tidy.training.coded_datasets.layout import Layout
-from kornia_tidy.training.coded_datasets.shard_samples import decode_sample
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 from kornia_tidy.training.record import training_record
 from tests.data.published import write_nyu

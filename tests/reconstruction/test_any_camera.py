@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction import AnyCameraHead, NAFNet, closed_form_channels
+from kornia_tidy import PSFBank
+from kornia_tidy.reconstruction import AnyCameraHead, ClosedFormHead, NAFNet, closed_form_channels
 from kornia_tidy.reconstruction.any_camera import MOST, SHARE, from_one_camera
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from tests.base import BaseTester
 from tests.reconstruction.test_closed_form import bank, photo
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
-from kornia_tidy import SensorNoise
-from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy import SensorNoise, TiDyOptics
 from kornia_tidy.data import photographic_leaves
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import (

@@ -9,18 +9,9 @@ import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
-from kornia_tidy import SensorNoise
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.closed_form import (
-    FINE_WEIGHT,
-    LAYER_WEIGHT,
-    NODES,
-    NOISE,
-    WEIGHTS,
-    WIENER_NOISES,
-    ClosedForm,
-    closed_form_channels,
-)
+from kornia_tidy import PSFBank, SensorNoise
+from kornia_tidy.reconstruction import ClosedForm, closed_form_channels
+from kornia_tidy.reconstruction.closed_form import FINE_WEIGHT, LAYER_WEIGHT, NODES, NOISE, WEIGHTS, WIENER_NOISES
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels

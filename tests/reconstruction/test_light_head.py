@@ -13,23 +13,17 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import nn
 
 import kornia_tidy
-from kornia_tidy import ThinLensCamera
+from kornia_tidy import SensorNoise, ThinLensCamera
 from kornia_tidy.data import DeadLeaves, PhotographicLeaves, dead_leaves
 from kornia_tidy.reconstruction import receptive_field
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
-from kornia_tidy.reconstruction.light_head import (
-    LightHead,
-    UncertainReconstruction,
-    reconstruct_light,
-    with_noise_of,
-)
+from kornia_tidy.reconstruction.light_head import LightHead, UncertainReconstruction, reconstruct_light, with_noise_of
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import channels_of
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, update_psfs
-from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
 from tests.reconstruction.test_restored_over_field import CORNER, camera
 

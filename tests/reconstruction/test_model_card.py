@@ -7,8 +7,7 @@ import re
 import pytest
 import torch
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.masks.pixelwise import PixelwiseMask
+from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.reconstruction.model_card import model_card
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_record
 from kornia_tidy.reconstruction.settings import SystemSettings

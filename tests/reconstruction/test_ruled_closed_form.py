@@ -7,12 +7,10 @@ import math
 import pytest
 import torch
 
-from kornia_tidy import SensorNoise
-from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction import RuledClosedForm, reconstruct_tiled
+from kornia_tidy import PSFBank, SensorNoise
+from kornia_tidy.data import PHOTOGRAPHS
+from kornia_tidy.reconstruction import ClosedFormHead, RuledClosedForm, reconstruct_tiled
 from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, band_facts, light_detail, predicted_errors
 from tests.base import BaseTester

@@ -7,14 +7,8 @@ import pytest
 import torch
 
 from kornia_tidy import PSFBank
-from kornia_tidy.reconstruction.tikhonov import (
-    BORDERS,
-    Tikhonov,
-    TikhonovLayers,
-    tikhonov,
-    tikhonov_layers,
-    transfer_function,
-)
+from kornia_tidy.reconstruction import Tikhonov, TikhonovLayers
+from kornia_tidy.reconstruction.tikhonov import BORDERS, tikhonov, tikhonov_layers, transfer_function
 from tests.base import BaseTester
 from tests.reconstruction.banks import flat_capture, make_bank, make_psfs
 

@@ -17,7 +17,7 @@ from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.data_sets import PAINTED, SCENES, _photographs, make_scenes
 from kornia_tidy.training.scenes import SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 from tests.data.published import write_flying_things, write_nyu
 
 pytestmark = pytest.mark.filterwarnings(
@@ -106,14 +106,6 @@ class TestMakeScenes(BaseTester):
         assert [len(part) for part in paths] == [10, 1, 1]
         assert len(set.union(*paths)) == 12
         assert paths != [set(_photographs(settings.replace(seed=2), part)) for part in ("train", "validation", "test")]
-
-    def test_feature_a_folder_is_split_by_the_seed(self, roots):
-        settings = settings_of("rgbd-folder", roots)
-        parts = [names_of(make_scenes(settings, split)) for split in ("train", "validation", "test")]
-        assert set.union(*parts) == names_of(make_scenes(settings, "all")) == {f"{i:02d}" for i in range(PAIRS)}
-        assert parts == [names_of(make_scenes(settings, split)) for split in ("train", "validation", "test")]
-        tests = {min(names_of(make_scenes(settings.replace(seed=seed), "test"))) for seed in range(6)}
-        assert len(tests) > 2
 
     def test_feature_training_crops_follow_from_epoch_and_scene_whoever_loads_them(self, roots):
         """The picture's red and green say which row and column they were, and depth and mask come along."""
@@ -247,34 +239,3 @@ class TestEndToEnd(BaseTester):
         assert main([*command, "--data", "rgbd-folder", "--root", str(roots["rgbd-folder"])]) == 0
         summary = json.loads((tmp_path / "e" / "summary.json").read_text())
         assert (summary["scenes"], summary["split"]) == (PAIRS, "all")
-
-    # The units of flying things are nobody's metres; where all of it is far for a lens, that is told.
-    @pytest.mark.filterwarnings("ignore:the nearest pixel is")
-    @pytest.mark.parametrize("name", ["flying-things", "flying-things-patches", "nyu", "rgbd-folder"])
-    def test_feature_real_samples(self, name, tmp_path, capsys):
-        """Samples of the published files, where the readers expect them."""
-        pytest.importorskip("lightning.pytorch")
-        root = tmp_path / "data"
-        root.mkdir()
-        if name == "nyu":
-            for file in ("nyu_depth_v2_labeled", "splits"):
-                (root / f"{file}.mat").symlink_to(shared(f"data/nyu_layout/{file}_TINY.mat"))
-        elif name == "rgbd-folder":
-            for file in ("color", "depth"):
-                (root / file).symlink_to(shared(f"data/rgbd/slambook2/ch5_rgbd/{file}", {"*.*": 5}))
-            about = {"image": "color/*.png", "depth": "depth/*.pgm", "scale": 0.001}
-            (root / "rgbd.json").write_text(json.dumps(about))
-        else:
-            for part, count in {**PARTS, "TRAIN/A": 8}.items():
-                for sequence in range(count):
-                    for kind, suffix in (("frames_cleanpass", "png"), ("disparity", "pfm")):
-                        view = root / kind / part / f"{sequence:04d}" / "left"
-                        view.mkdir(parents=True)
-                        frame = ("0006", "0012")[sequence % 2]
-                        (view / f"{frame}.{suffix}").symlink_to(
-                            shared(f"data/rgbd/flyingthings3d_subset/{kind}/0000/left/{frame}.{suffix}")
-                        )
-        row, summary = train_and_evaluate(name, root, tmp_path, capsys)
-        assert 0 < float(row["depth_counted"]) <= 1
-        assert 0 < float(row["depth_rmse"]) < 2
-        assert summary["settings"]["data"] == name

@@ -9,14 +9,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from kornia_tidy import DwellTimes, SpatialLightModulator
 from kornia_tidy.cli import main
-from kornia_tidy.design.candidates import FLAT, Candidate
-from kornia_tidy.design.co_design import CoDesign
-from kornia_tidy.design.design_report import design_files
-from kornia_tidy.design.design_task import DesignTask
-from kornia_tidy.design.verdict import Finalist, Verdict
-from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
-from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.design import Candidate, CoDesign, DesignTask, Finalist, Verdict, design_files
+from kornia_tidy.design.candidates import FLAT
+from kornia_tidy.modulator import GreyLevels
 from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.design_folder import designed_settings
 from kornia_tidy.training.settings import TrainingSettings
@@ -49,11 +46,6 @@ class TestDesignedSettings(BaseTester):
         assert settings.depth_range == (0.5, 4.0)
         assert settings.camera().focus_distance == pytest.approx(4.0)  # the far end
         assert settings.mask_size == 23
-
-    def test_feature_a_recommended_lens_has_no_masks(self, tmp_path):
-        settings = designed_settings(folder_of_design(tmp_path / "a", -0.5))
-        assert (settings["masks"], settings["start"], settings["f_number"]) == (1, "flat", 41.0)
-        assert settings["focus_distance"] == pytest.approx(1 / (0.25 + 0.3 * 1.75))
 
     def test_feature_a_focus_at_infinity(self, tmp_path):
         folder = folder_of_design(tmp_path / "a", 1.5, DesignTask(masks=2))

@@ -3,8 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import TiDyOptics
-from kornia_tidy.sensor import SensorNoise
+from kornia_tidy import SensorNoise, TiDyOptics
 from kornia_tidy.training.drawn_sensors import SensorEach, with_sensor
 from tests.base import BaseTester
 

@@ -203,16 +203,6 @@ class TestNoisyCrops(BaseTester):
         self.assert_close(sample["noise"], expected, rtol=1e-5, atol=1e-7)
         assert sample["noise"].std() > 1e-3
 
-    def test_feature_without_crop_the_whole_capture_is_seen_and_its_gain_varies_unless_it_is_for_scores(self, leaves):
-        captures, optics = leaves
-        torch.manual_seed(0)
-        whole = NoisyCrops(captures, optics)
-        light = [whole[0]["image"].mean() for _ in range(4)]
-        assert whole[0]["image"].shape == (3, 32, 32)
-        assert torch.stack(light).std() > 0.01
-        scored = NoisyCrops(captures, optics, gain=False)[0]["image"]
-        assert torch.equal(scored, optics.encode(captures[0].image[None])[0])
-
     def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
         assert electrons_of(35.2, (500.0, 57e3), 17.6) == (125.0, 14250.0)
         assert electrons_of(50.0, None, 17.6) == FULL_WELL
@@ -226,13 +216,6 @@ class TestNoisyCrops(BaseTester):
         place = [math.log(random_sensor((1e-3, 0.03)).sigma / 1e-3, 30) for _ in range(2000)]
         # Kolmogorov-Smirnov: a uniform sample of 2000 deviates by more than 0.044 once in a thousand.
         assert np.abs(np.sort(place) - np.linspace(0, 1, 2000)).max() < 0.044
-
-    def test_feature_half_of_the_sensors_have_shot_noise(self):
-        torch.manual_seed(0)
-        wells = [random_sensor((1e-3, 0.03)).full_well for _ in range(1000)]
-        shot = [well for well in wells if well is not None]
-        assert 420 < len(shot) < 580  # five standard errors
-        assert FULL_WELL[0] <= min(shot) <= max(shot) <= FULL_WELL[1]
 
     def test_feature_gains_stay_in_their_range_and_below_full_scale(self):
         torch.manual_seed(0)

@@ -7,8 +7,7 @@ import torch
 
 from kornia_tidy.cli import main
 from kornia_tidy.cli.commands import demo
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data import read_image, write_depth, write_image
 from kornia_tidy.figures import demonstration
 from tests.base import BaseTester
 

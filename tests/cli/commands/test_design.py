@@ -5,13 +5,12 @@ import json
 import pytest
 import torch
 
-from kornia_tidy.cli.command_line import main, read_command
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy import DwellTimes, SpatialLightModulator, Switching
+from kornia_tidy.cli import main
+from kornia_tidy.cli.command_line import read_command
+from kornia_tidy.data import read_image, write_depth, write_image
 from kornia_tidy.data.rgbd_folder import scenes_in
 from kornia_tidy.design import Effort
-from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
-from kornia_tidy.modulator.switching import Switching
 from tests.base import BaseTester
 
 TINY = Effort(coarse_steps=1, steps=1, starts=("focal sweep",), scenes=4, size=97)

@@ -15,14 +15,13 @@ from kornia_tidy.lab.calibration.noise.photon_transfer import write_json
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs, measured_camera
 from kornia_tidy.lab.mask_export import write_heights
 from kornia_tidy.lab.measured import closed_form_system
-from kornia_tidy.lab.raw import RawCapture, develop, simulate_scene
-from kornia_tidy.lab.raw.capture import RawInfo
+from kornia_tidy.lab.raw import RawCapture, RawInfo, develop, simulate_scene
 from kornia_tidy.lab.raw.developed_noise import developed_noise
 from kornia_tidy.lab.raw.dng_file import write_dng
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.trained import load_trained
-from kornia_tidy.training.coded_datasets.captures import CodedCaptures
+from kornia_tidy.training.coded_datasets import CodedCaptures
 from tests.base import BaseTester
 from tests.cli.commands.test_raw_reconstruct import checkpoint
 from tests.measured import HEIGHTS, measured_noise, measured_psfs, sweep, write_measurements

@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data import image_files
-from kornia_tidy.data.image_files import read_image
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy.data import image_files, read_image
+from kornia_tidy.lab.raw import RawCapture, develop
 from tests.base import BaseTester
 from tests.lab.raw.dng import dng, patched
 

@@ -16,15 +16,14 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.cli.command_line import main, read_command
+from kornia_tidy.cli import main
+from kornia_tidy.cli.command_line import read_command
 from kornia_tidy.data import read_depth, read_image
 from kornia_tidy.figures import style
 from kornia_tidy.lab import capture_file
 from kornia_tidy.lab.capture_file import read_light
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy.lab.raw import RawCapture, develop, simulate_raw
 from kornia_tidy.lab.raw.dng_file import encode_dng
-from kornia_tidy.lab.raw.simulation import simulate_raw
 from kornia_tidy.lab.raw.tags import NOISE_PROFILE
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained

@@ -13,12 +13,9 @@ import pytest
 import torch
 
 from kornia_tidy import SensorNoise
-from kornia_tidy.data import read_image
-from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy.data import dead_leaves, read_image
+from kornia_tidy.lab.raw import RawCapture, develop, simulate_scene
 from kornia_tidy.lab.raw.dng_file import write_dng
-from kornia_tidy.lab.raw.simulation import simulate_scene
 from kornia_tidy.reconstruction import receptive_field
 from kornia_tidy.reconstruction.light_head import LightHead
 from kornia_tidy.reconstruction.pretrained import load_pretrained

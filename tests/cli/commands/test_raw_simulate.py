@@ -7,13 +7,10 @@ import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.data.rgbd import read_rgbd
-from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer, TransferLine, write_json
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
-from kornia_tidy.lab.raw.simulation import simulate_scene
+from kornia_tidy.data import read_image, read_rgbd, write_depth, write_image
+from kornia_tidy.lab.calibration.noise import PhotonTransfer
+from kornia_tidy.lab.calibration.noise.photon_transfer import TransferLine, write_json
+from kornia_tidy.lab.raw import RawCapture, develop, simulate_scene
 from kornia_tidy.optics import Lens
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light

@@ -8,11 +8,8 @@ import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data import fill_holes
-from kornia_tidy.data.depth_files import write_depth
+from kornia_tidy.data import fill_holes, read_image, read_rgbd, write_depth, write_image
 from kornia_tidy.data.depth_range import middle_depths
-from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.data.rgbd import read_rgbd
 from kornia_tidy.optics import Lens
 from kornia_tidy.optics.lens import NAMED_LENSES
 from tests.base import BaseTester

@@ -4,10 +4,8 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
-from kornia_tidy.optics import SYSTEMS
-from kornia_tidy.optics.published_systems import systems_table
+from kornia_tidy.data import read_image, write_depth, write_image
+from kornia_tidy.optics import SYSTEMS, systems_table
 from kornia_tidy.reconstruction.tasks import metres
 from tests.base import BaseTester
 

@@ -1,15 +1,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data import read_image, write_depth, write_image
 from kornia_tidy.design.tradeoff import TOLERANCES
 from kornia_tidy.design.tradeoff import sweep as real_sweep
 from kornia_tidy.fidelity import LAYERS

@@ -14,11 +14,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.lab.mask_export.frame_files import read_slm_frames, write_slm_frames
-from kornia_tidy.lab.mask_export.placement import FLIPS, ROTATIONS, PanelPlacement
-from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
-from kornia_tidy.lab.mask_export.timing import frame_times
-from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.lab.mask_export import PanelPlacement, SLMFrames, frame_times, read_slm_frames, write_slm_frames
+from kornia_tidy.lab.mask_export.placement import FLIPS, ROTATIONS
+from kornia_tidy.modulator import GreyLevels
 from tests.base import BaseTester
 
 SMALL = PanelPlacement((48, 60))

@@ -9,9 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.lab.raw import RawCapture, develop
 from kornia_tidy.lab.raw.auto_balance import auto_balance
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
 from kornia_tidy.lab.raw.filter_array import filter_tile, tiled
 from tests.base import BaseTester, shared
 from tests.lab.raw.dng import XTRANS

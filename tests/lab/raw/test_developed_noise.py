@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy import SensorNoise
+from kornia_tidy.lab.raw import RawCapture, RawInfo, develop
 from kornia_tidy.lab.raw.developed_noise import developed_noise
 from kornia_tidy.lab.raw.tags import NOISE_PROFILE, camera_tags
-from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
 from tests.lab.raw.dng import DOUBLE, dng
 

@@ -10,8 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy.lab.raw import RawCapture, develop
 from kornia_tidy.lab.raw.dng_file import encode_dng
 from kornia_tidy.lab.raw.dng_samples import decoded_by_libraw, plain_version, read_samples
 from kornia_tidy.lab.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import rawpy
 
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.lab.raw.develop import develop
+from kornia_tidy.lab.raw import RawCapture, develop
 from tests.base import BaseTester
 from tests.lab.raw.c330 import LENGTHS, ramp
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import torch
 
-from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
-from kornia_tidy.fidelity import Fidelity
 
 FAST = Fidelity.preset("draft").replace(window=23)
 

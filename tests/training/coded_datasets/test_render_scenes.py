@@ -17,7 +17,6 @@ from kornia_tidy import SensorNoise
 from kornia_tidy.data import RGBDFolder
 from kornia_tidy.training.coded_datasets import CodedCaptures, Layout, Rendered, render_scenes, shard_items_within
 from tests.base import BaseTester
-from tests.scenes import load_scene
 from tests.training.coded_datasets.samples import RandomScenes, contents, small_camera, small_scenes
 
 FORMS = [Layout(), Layout(shard_items=2)]
@@ -118,13 +117,6 @@ class TestRenderScenes(BaseTester):
         render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=0, world=2)
         assert contents(tmp_path) == contents(folder)
 
-    def test_feature_another_seed_is_another_noise(self, whole, tmp_path):
-        folder, layout = whole
-        render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=8)
-        one, other = CodedCaptures(folder)[0], CodedCaptures(tmp_path)[0]
-        assert torch.equal(one["image"], other["image"])
-        assert not torch.equal(one["coded"], other["coded"])
-
     def test_feature_scenes_of_tensors_that_draw_at_random(self, tmp_path):
         """Without mask or name, drawn from the global generator: the same whoever renders which, and nobody's draws."""
         torch.manual_seed(5)
@@ -155,14 +147,6 @@ class TestRenderScenes(BaseTester):
         assert about["camera"]["aperture_diameter"] == 2.835e-3
         assert about["camera"]["depth_range"] == [0.2975, "inf"]
         assert (about["noise_seed"], about["captures"], about["sensor"]["sigma"]) == (7, 5, 0.01)
-
-    def test_feature_progress_is_told(self, whole, tmp_path):
-        _, layout = whole
-        steps = []
-        render_scenes(
-            small_camera(), small_scenes(), tmp_path, layout, each=lambda done, all_: steps.append((done, all_))
-        )
-        assert steps == [(i, 5) for i in range(1, 6)]
 
 
 class TestShards(BaseTester):
@@ -277,23 +261,6 @@ class TestRefusals(BaseTester):
     def test_exception_processes_are_counted_from_zero(self, tmp_path):
         with pytest.raises(ValueError, match="rank one of 2 from 0, got 1 and 2"):
             render_scenes(small_camera(), small_scenes(), tmp_path, rank=2, world=2)
-
-
-class TestRealScenes(BaseTester):
-    def test_feature_photographs_with_holes_in_their_depth(self, tmp_path):
-        """Crops of stereo and of Kinect frames, whose holes differ; those too near for the lens are counted."""
-        scenes = []
-        for name in ("aloe", "7scenes-000000", "open3d-redwood-0"):
-            image, depth, valid = (part[:, 100:228, 200:328] for part in load_scene(name))
-            scenes.append({"image": image, "depth": depth, "mask": valid, "name": name})
-        assert not all(scene["mask"].all() for scene in scenes)
-        optics = small_camera(check_inputs=False)
-        render_scenes(optics, scenes, tmp_path, Layout(shard_items=2))
-        for scene, got in zip(scenes, CodedCaptures(tmp_path), strict=True):
-            assert torch.equal(got["mask"], scene["mask"])
-            assert torch.equal(got["depth"], scene["depth"])
-            self.assert_close(got["image"], scene["image"], rtol=0, atol=0.5 / 65535 + 1e-7)
-            assert got["name"] == scene["name"]
 
 
 class TestCodedCaptures(BaseTester):

@@ -14,18 +14,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from scipy.optimize import curve_fit
 
-from kornia_tidy.lab.calibration.noise.photon_transfer import (
-    PhotonTransfer,
-    TransferLine,
-    fit_line,
-    photon_transfer,
-    read_json,
-    write_json,
-)
+from kornia_tidy import SensorNoise
+from kornia_tidy.lab.calibration.noise import PhotonTransfer, photon_transfer
+from kornia_tidy.lab.calibration.noise.photon_transfer import TransferLine, fit_line, read_json, write_json
 from kornia_tidy.lab.calibration.noise.transfer_curve import CurvePoint
-from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
-from kornia_tidy.lab.raw.simulation import simulate_raw
-from kornia_tidy.sensor.sensor import SensorNoise
+from kornia_tidy.lab.raw import RawCapture, RawInfo, simulate_raw
 from tests.base import BaseTester, shared
 from tests.lab.calibration.noise.flats import flat, flats
 

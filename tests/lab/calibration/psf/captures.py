@@ -8,9 +8,8 @@ from torch.nn.functional import avg_pool2d
 
 from kornia_tidy import Spectrum, ThinLensCamera
 from kornia_tidy.masks import PhaseMasks
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.optics import circular_aperture
+from kornia_tidy.psf import Pupil, exact_psf_bank
 
 FINE = 9  # subdivisions of a pixel along each side; points have positions on this grid
 

@@ -13,10 +13,9 @@ from safetensors.torch import load_file, save_file
 from kornia_tidy import SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs, measured_camera
-from kornia_tidy.reconstruction import ClosedFormHead, LayeredJointHead, Refocused
+from kornia_tidy.reconstruction import ClosedFormHead, LayeredJointHead, NAFNet, Refocused
 from kornia_tidy.reconstruction.layered_joint import REFINED_FROM
 from kornia_tidy.reconstruction.metrics import psnr
-from kornia_tidy.reconstruction.nafnet import NAFNet
 from kornia_tidy.reconstruction.trained import update_psfs
 from tests.base import BaseTester
 from tests.measured import DISTANCES, LENS, measured_psfs

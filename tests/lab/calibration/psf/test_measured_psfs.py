@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from kornia_tidy import PixelwiseMask, PSFBank, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.lab.calibration.psf import MeasuredPSFs, diffraction_cutoff, measure_psfs, point_images
-from kornia_tidy.lab.calibration.psf.point_images import PointImage
-from kornia_tidy.masks.initial_heights import fisher_mask
-from kornia_tidy.render.compositing import render
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointImage, diffraction_cutoff, measure_psfs, point_images
+from kornia_tidy.masks import fisher_mask
+from kornia_tidy.render import render
 from tests.base import BaseTester
 from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
 
