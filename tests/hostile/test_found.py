@@ -30,10 +30,6 @@ def changed(**values):
     return lambda data: json.dumps({**json.loads(data), **values}).encode()
 
 
-def last_line_cut(data):
-    return data.rstrip().rpartition(b",")[0] + b"\n"
-
-
 def place(text):
     """Return what puts a place of a capture into an index."""
     return lambda data: b"key,name,clamped_pixels,coded\n000000,a,0," + text + b"\n"

@@ -141,10 +141,3 @@ def exr_attribute(data: bytes, generator: Generator) -> bytes:
     value = int(pick(generator, (*NUMBERS, 4, 5, 6, 9, 31, 52, 64))) % 2 ** (7 if form == "<B" else 31)
     struct.pack_into(form, array, min(place, len(array) - 8), value)
     return bytes(array)
-
-
-def bytes_of(values: np.ndarray) -> bytes:
-    """Return the bytes of an NPY file, with pickled objects if there are any."""
-    file = io.BytesIO()
-    np.save(file, values, allow_pickle=True)
-    return file.getvalue()
