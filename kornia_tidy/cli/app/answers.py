@@ -47,10 +47,11 @@ def answer(values: Mapping[str, Any], tell: Tell = lambda share, stage: None) ->
     """
     try:
         start = time.perf_counter()
-        result = take_picture(settings_of(values), tell)
+        settings = settings_of(values)
+        result = take_picture(settings, tell)
         tell(0.85, "pictures")
         pictures = draw(result)
-        return Answer(status(result, time.perf_counter() - start), pictures, legends(result), as_python(result))
+        return Answer(status(result, time.perf_counter() - start), pictures, legends(result), as_python(settings))
     except Exception as error:
         if not isinstance(error, (ImportError, OSError, TypeError, ValueError)):
             traceback.print_exception(error)

@@ -54,7 +54,7 @@ class TestAnswer(BaseTester):
     def test_feature_uploaded_files(self, tmp_path):
         found = self.uploaded(tmp_path, torch.linspace(0.5, 2, 96).expand(1, 72, 96).contiguous())
         assert found.pictures["scene"].shape == (72, 96, 3)
-        assert 'read_files("photo.png", "depth.npy", depth_scale=1.0, side=96)' in found.script
+        assert "    side=96,\n    image_file='photo.png',\n    depth_file='depth.npy',\n" in found.script
 
     @pytest.mark.parametrize(
         ("depth", "values", "sentence"),

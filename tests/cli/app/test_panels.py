@@ -154,8 +154,7 @@ class TestFiles(BaseTester):
         assert not torch.equal(take_picture(Settings(**files)).capture, before)
 
     def test_feature_the_script_has_the_unit_to_the_last_digit(self, files):
-        result = take_picture(Settings(**files, depth_scale=1 / 256 * 100))
-        assert f"depth_scale={1 / 256 * 100!r}" in as_python(result)
+        assert f"depth_scale={1 / 256 * 100!r}" in as_python(Settings(**files, depth_scale=1 / 256 * 100))
 
     def test_feature_a_fitted_lens_keeps_the_pixels_of_the_settings(self, files):
         read = read_files("photo.png", "depth.npy", 1.0, 96)
