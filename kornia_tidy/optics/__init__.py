@@ -5,7 +5,7 @@ indices and channel weights of wavelengths go out. ``quadrature.py`` integrates 
 inputs in a wrong unit. Read ``thin_lens.py`` first.
 """
 
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from kornia_tidy.optics.lens.lens import Lens, LensRangeWarning
 from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, Material, cauchy_through, constant_index
 from kornia_tidy.optics.published_systems import SYSTEMS, System, published_system, systems_table
@@ -31,7 +31,6 @@ __all__ = [
     "cauchy_through",
     "circular_aperture",
     "constant_index",
-    "polygon_aperture",
     "published_system",
     "systems_table",
     "thin_lens_defocus",

@@ -8,7 +8,6 @@ column j is x, and y grows downwards as in an image. A shape larger than the gri
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Any, Literal
 
 import torch
@@ -19,7 +18,6 @@ from kornia_tidy.checks import check_choice, check_positive, check_values, unmas
 Edges = Literal["binary", "area"]
 
 TOLERANCE = 1e-9  # pupil radii; keeps cells open if their centre is on the rim, such as (0.6, 0.8), despite rounding
-ROUND_OFF = 1e-12  # covered fractions closer to 0 or 1 than this are set to 0 or 1
 
 
 class OpenArea(Tensor):
@@ -117,54 +115,6 @@ def annular_aperture(size: int, pitch: float, inner: float, radius: float = 1.0,
     return _made((_disc(size, pitch, radius, edges) - _disc(size, pitch, inner, edges)).clamp(min=0), edges)
 
 
-def polygon_aperture(
-    size: int, pitch: float, sides: int, rotation: float = 0.0, radius: float = 1.0, *, edges: Edges = "binary"
-) -> Tensor:
-    """Return the amplitude of a regular polygon: an iris with straight blades, or a square pupil.
-
-    Args:
-        size: cells along a side of the grid.
-        pitch: side of a cell in pupil radii.
-        sides: number of sides, at least 3.
-        rotation: angle of the first corner in radians, from +x towards +y.
-        radius: distance from the axis to the corners in pupil radii.
-        edges: "binary" or "area", see :func:`circular_aperture`.
-
-    Returns:
-        Amplitude in [0, 1], float64; with "area" an :class:`OpenArea`.
-
-    Shape:
-        (size, size)
-
-    Raises:
-        ValueError: if a length or ``sides`` is out of range, ``edges`` is unknown, or no cell is open.
-
-    Convention:
-        A square of half-width 1 with sides along the axes has its corners at radius √2 and a rotation of 45°.
-
-    Example:
-        >>> polygon_aperture(4, 1.0, sides=4, rotation=math.pi / 4, radius=math.sqrt(2))
-        tensor([[0., 0., 0., 0.],
-                [0., 1., 1., 0.],
-                [0., 1., 1., 0.],
-                [0., 0., 0., 0.]], dtype=torch.float64)
-    """
-    _check_grid(size, pitch, edges)
-    check_positive("radius", radius, "pupil radii")
-    if sides != int(sides) or sides < 3:
-        raise ValueError(f"sides must be a whole number of at least 3, got {sides}")
-    if not math.isfinite(rotation):
-        raise ValueError(f"rotation must be finite radians, got {rotation}")
-    if edges == "binary":
-        return _made(_polygon_contains_centres(size, pitch, sides, rotation, radius), edges)
-    angles = [rotation + 2 * math.pi * k / sides for k in range(sides)]
-    corners = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
-    cover = _polygon_cover(_grid_lines(size, pitch), corners) / pitch**2
-    cover[cover < ROUND_OFF] = 0
-    cover[cover > 1 - ROUND_OFF] = 1
-    return _made(cover, edges)
-
-
 def check_aperture(aperture: Any, size: int) -> Tensor:
     """Check a custom aperture and return it as float64.
 
@@ -251,35 +201,3 @@ def _disc_area_up_to(lines: Tensor, radius: float) -> Tensor:
     straight = distance[:, None] * distance
     inside = torch.hypot(distance[:, None], distance) <= radius
     return torch.where(inside, straight, curved) * lines.sign()[:, None] * lines.sign()
-
-
-def _polygon_contains_centres(size: int, pitch: float, sides: int, rotation: float, radius: float) -> Tensor:
-    x = _cell_centres(size, pitch)
-    y = x[:, None]
-    normals = [rotation + (2 * k + 1) * math.pi / sides for k in range(sides)]
-    reach = torch.stack([x * math.cos(normal) + y * math.sin(normal) for normal in normals]).amax(dim=0)
-    return (reach <= radius * math.cos(math.pi / sides) + TOLERANCE).double()
-
-
-def _polygon_cover(lines: Tensor, corners: list[tuple[float, float]]) -> Tensor:
-    """Return the area that a simple polygon covers in each cell; its corners come in order of increasing angle.
-
-    By Green's theorem the area in a cell is minus the integral of y dx around the polygon, with x and y clipped to
-    the cell. A side is straight, so its clipped height is linear between the points where it crosses the cell's
-    lower and upper boundary, and the trapezoid rule over these points is exact.
-    """
-    left, right = lines[:-1], lines[1:]
-    bottom, top = left[:, None], right[:, None]
-    cover = torch.zeros(len(left), len(left), dtype=torch.float64)
-    for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
-        if x0 == x1:  # a vertical side has no dx
-            continue
-        gradient = (y1 - y0) / (x1 - x0)
-        start, end = left.clamp(min=min(x0, x1)), right.clamp(max=max(x0, x1))
-        end = torch.maximum(start, end)
-        crossings = [(x0 + (y - y0) / gradient).clamp(start, end) for y in (bottom, top)] if gradient else []
-        nodes = torch.broadcast_tensors(cover, start, *crossings, end)[1:]  # cover gives the shape only
-        x = torch.stack(nodes).sort(dim=0).values
-        height = (y0 + gradient * (x - x0)).clamp(bottom, top) - bottom
-        cover -= math.copysign(1, x1 - x0) * torch.trapezoid(height, x, dim=0)
-    return cover

@@ -11,8 +11,9 @@ from torch import Tensor
 from kornia_tidy import FresnelLens, PixelwiseMask
 from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.masks import mask_coordinates
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from tests.base import BaseTester
+from tests.polygons import polygon_aperture
 
 APERTURES = {
     "disc": circular_aperture(23),

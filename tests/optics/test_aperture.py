@@ -16,18 +16,12 @@ from kornia_tidy.optics.aperture import (
     check_aperture,
     circular_aperture,
     light_through,
-    polygon_aperture,
 )
 from tests.base import BaseTester
 
-SQUARE = {"sides": 4, "rotation": math.pi / 4, "radius": math.sqrt(2)}  # half-width 1, sides along the axes
 both_edges = pytest.mark.parametrize("edges", ["binary", "area"])
 fast = settings(max_examples=40)
 sizes, pitches, radii = st.integers(1, 17), st.floats(0.05, 0.2), st.floats(0.5, 2.0)
-
-
-def polygon_area(sides: int, radius: float) -> float:
-    return sides / 2 * radius**2 * math.sin(2 * math.pi / sides)
 
 
 def sampled_cover(size: int, pitch: float, inside, subdivisions: int = 64) -> torch.Tensor:
@@ -137,77 +131,6 @@ class TestAnnularAperture(BaseTester):
         self.assert_close(whole, circular_aperture(23, edges=edges), rtol=0, atol=1e-12)
 
 
-class TestPolygonAperture(BaseTester):
-    @pytest.mark.parametrize("sides", [2, 0, -4, 4.5])
-    def test_exception_sides(self, sides):
-        with pytest.raises(ValueError, match=f"sides must be a whole number of at least 3, got {sides}"):
-            polygon_aperture(23, 0.1, sides)
-
-    def test_exception_rotation_and_radius(self):
-        with pytest.raises(ValueError, match="rotation must be finite radians, got nan"):
-            polygon_aperture(23, 0.1, 6, rotation=math.nan)
-        with pytest.raises(ValueError, match="radius must be positive and finite pupil radii, got -1"):
-            polygon_aperture(23, 0.1, 6, radius=-1)
-
-    @pytest.mark.parametrize("sides", [3, 4, 5, 6, 7, 100])
-    @pytest.mark.parametrize("rotation", [0.0, 0.3, math.pi / 4, math.pi / 2])
-    @pytest.mark.parametrize(("size", "pitch"), [(23, 0.1), (20, 0.1), (129, 1 / 64)])
-    def test_feature_areas_add_up_to_the_polygon(self, sides, rotation, size, pitch):
-        aperture = polygon_aperture(size, pitch, sides, rotation, edges="area")
-        assert aperture.sum().item() * pitch**2 == pytest.approx(polygon_area(sides, 1.0), abs=1e-12)
-
-    @pytest.mark.parametrize(
-        ("sides", "rotation", "radius"), [(3, 0.2, 1.0), (5, 0.0, 0.8), (6, 1.0, 1.3), (4, 0.1, 0.3)]
-    )
-    @pytest.mark.parametrize(("size", "pitch"), [(7, 0.3), (4, 0.37)])
-    def test_feature_a_cell_holds_its_covered_fraction(self, sides, rotation, radius, size, pitch):
-        """Against 64² points in each cell; a point is inside if it lies on the axis' side of every edge."""
-
-        def inside(x, y):
-            middles = rotation + (2 * np.arange(sides) + 1) * np.pi / sides
-            reach = np.cos(middles)[:, None, None] * x + np.sin(middles)[:, None, None] * y
-            return (reach <= radius * np.cos(np.pi / sides)).all(axis=0)
-
-        aperture = polygon_aperture(size, pitch, sides, rotation, radius, edges="area")
-        self.assert_close(aperture, sampled_cover(size, pitch, inside), rtol=0, atol=8e-3)
-
-    def test_feature_a_square_through_cell_centres_halves_them(self):
-        """23 cells of 0.1: the rim runs through the centres of row and column 1, so they are half covered."""
-        weights = torch.tensor([0, 0.5, *[1.0] * 19, 0.5, 0], dtype=torch.float64)
-        expected = weights[:, None] * weights
-        self.assert_close(polygon_aperture(23, 0.1, **SQUARE, edges="area"), expected, rtol=0, atol=1e-12)
-        assert torch.equal(polygon_aperture(23, 0.1, **SQUARE), (expected > 0).double())  # the rim is inside
-
-    @both_edges
-    def test_convention_the_first_corner_is_on_the_right_and_turns_down(self, edges):
-        """Rows are y, downwards; columns are x. The triangle's first corner is at +x; a quarter turn moves it to +y."""
-        right = polygon_aperture(23, 0.1, 3, edges=edges)
-        assert right[11, 20] > 0
-        assert right[11, 2] == right[2, 11] == right[20, 11] == 0
-        down = polygon_aperture(23, 0.1, 3, rotation=math.pi / 2, edges=edges)
-        assert down[20, 11] > 0
-        self.assert_close(down, right.rot90(-1), rtol=0, atol=1e-12)
-
-    @both_edges
-    @given(size=sizes, radius=radii, sides=st.integers(3, 9), rotation=st.floats(-7, 7))
-    @example(size=12, radius=1.5, sides=3, rotation=0.0)  # the incircle, rounded, crosses a grid line by 2e-16
-    @fast
-    def test_property_lies_between_its_incircle_and_circumcircle(self, edges, size, radius, sides, rotation):
-        pitch = 0.15
-        polygon = polygon_aperture(size, pitch, sides, rotation, radius, edges=edges)
-        inner = circular_aperture(size, pitch, radius * math.cos(math.pi / sides), edges=edges)
-        outer = circular_aperture(size, pitch, radius, edges=edges)
-        assert 0 <= polygon.min() <= polygon.max() <= 1
-        assert bool((inner <= polygon + 1e-11).all())
-        assert bool((polygon <= outer + 1e-11).all())
-
-    @given(sides=st.integers(3, 9), rotation=st.floats(-7, 7))
-    @fast
-    def test_property_a_turn_by_one_side_changes_nothing(self, sides, rotation):
-        turned = polygon_aperture(15, 0.16, sides, rotation + 2 * math.pi / sides, edges="area")
-        self.assert_close(turned, polygon_aperture(15, 0.16, sides, rotation, edges="area"), rtol=0, atol=1e-11)
-
-
 class TestCheckAperture(BaseTester):
     def test_feature_returns_the_values_in_float64(self, device, dtype):
         aperture = torch.rand(5, 5, device=device, dtype=dtype)
@@ -258,7 +181,6 @@ class TestOpenArea(BaseTester):
         [
             circular_aperture(23, edges="area"),
             annular_aperture(23, 0.1, 0.37, edges="area"),
-            polygon_aperture(23, 0.1, 6, 0.2, edges="area"),
         ],
     )
     def test_feature_light_is_the_open_area(self, aperture):

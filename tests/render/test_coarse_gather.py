@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.psf.geometric_psf import geometric_psfs
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -17,6 +17,7 @@ from kornia_tidy.render.compositing import gather
 from kornia_tidy.render.dispatch import Rendering
 from kornia_tidy.render.pieces import Piece, render_piece
 from tests.base import BaseTester
+from tests.polygons import polygon_aperture
 
 STEP = 1.625e-6
 PUPIL = pupil_over((1, 23, 23), None, 1.0)
