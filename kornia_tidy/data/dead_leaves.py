@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from numbers import Integral
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import cv2
 import numpy as np
@@ -115,7 +116,51 @@ def depth_of(inverse_depth: NDArray[np.float64], near: float, far: float) -> NDA
     return depth.astype(np.float32).clip(near, far)
 
 
-class DeadLeaves(SceneDataset):
+class PaintedScenes(SceneDataset):
+    """Base class of data sets of scenes that are painted on access and not stored; each has a seed of its own.
+
+    Subclasses name their scenes, and paint them by :meth:`paint`. For arguments see :class:`DeadLeaves`.
+    """
+
+    kind: ClassVar[str]
+    key: ClassVar[str]  # of the seeds of scenes
+
+    def __init__(
+        self,
+        length: int,
+        height: int,
+        width: int,
+        *,
+        depth_range: tuple[float, float] = (0.3, 10.0),
+        seed: int = 0,
+        transform: Transform | None = None,
+    ) -> None:
+        super().__init__(transform)
+        if not isinstance(length, Integral) or length < 1:
+            raise ValueError(f"length must be a positive integer, got {length!r}")
+        check_arguments(height, width, depth_range, 1, seed)
+        self.length, self.height, self.width = length, height, width
+        self.depth_range, self.seed = depth_range, seed
+
+    @abstractmethod
+    def paint(self, seed: int) -> tuple[Tensor, Tensor]:
+        """Return image and depth of the scene of a seed."""
+
+    def __len__(self) -> int:
+        """Return the number of scenes."""
+        return self.length
+
+    def name(self, index: int) -> str:
+        """Return the seed and the number of a scene."""
+        return f"{self.kind} {self.seed}/{index}"
+
+    def read(self, index: int) -> Scene:
+        """Paint a scene."""
+        image, depth = self.paint(keyed_seed(self.seed, self.key, index))
+        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
+
+class DeadLeaves(PaintedScenes):
     """Data set of dead-leaves scenes, painted on access and not stored. See :func:`dead_leaves`.
 
     Args:
@@ -136,6 +181,8 @@ class DeadLeaves(SceneDataset):
         (1000, torch.Size([3, 48, 64]), 'dead leaves 0/7')
     """
 
+    kind, key = "dead leaves", "scene"
+
     def __init__(
         self,
         length: int,
@@ -147,30 +194,15 @@ class DeadLeaves(SceneDataset):
         seed: int = 0,
         transform: Transform | None = None,
     ) -> None:
-        super().__init__(transform)
-        if not isinstance(length, Integral) or length < 1:
-            raise ValueError(f"length must be a positive integer, got {length!r}")
-        if num_leaves is None:
-            num_leaves = min(MOST_LEAVES, max(1, height * width // PIXELS_A_LEAF))
-        check_arguments(height, width, depth_range, num_leaves, seed)
-        self.length, self.height, self.width = length, height, width
-        self.depth_range, self.num_leaves, self.seed = depth_range, num_leaves, seed
+        super().__init__(length, height, width, depth_range=depth_range, seed=seed, transform=transform)
+        default = min(MOST_LEAVES, max(1, height * width // PIXELS_A_LEAF))
+        self.num_leaves = default if num_leaves is None else num_leaves
+        check_arguments(height, width, depth_range, self.num_leaves, seed)
 
-    def __len__(self) -> int:
-        """Return the number of scenes."""
-        return self.length
-
-    def name(self, index: int) -> str:
-        """Return the seed and the number of a scene."""
-        return f"dead leaves {self.seed}/{index}"
-
-    def read(self, index: int) -> Scene:
-        """Paint a scene."""
-        seed = keyed_seed(self.seed, "scene", index)
-        image, depth = dead_leaves(
-            self.height, self.width, depth_range=self.depth_range, num_leaves=self.num_leaves, seed=seed
-        )
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+    def paint(self, seed: int) -> tuple[Tensor, Tensor]:
+        """Return image and depth of the scene of a seed."""
+        size, leaves = (self.height, self.width), self.num_leaves
+        return dead_leaves(*size, depth_range=self.depth_range, num_leaves=leaves, seed=seed)
 
 
 def check_arguments(height: int, width: int, depth_range: tuple[float, float], num_leaves: int, seed: int) -> None:

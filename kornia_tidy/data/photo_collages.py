@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
+from kornia_tidy.data.dead_leaves import PaintedScenes, check_arguments, depth_of, rasterise, scatter_leaves
 from kornia_tidy.data.image_files import SUFFIXES, as_image
 from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
-from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.data.scene_dataset import Transform
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import find_files
-from kornia_tidy.seeds import keyed_seed
 
 PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes
 DISPLACED_SHARE = 0.5  # share of scenes with outlines of depth beside those of the image, as in depth maps of sensors
@@ -113,7 +110,7 @@ def photo_collage(
     return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
 
-class PhotoCollages(SceneDataset):
+class PhotoCollages(PaintedScenes):
     """Data set of collages of photographs. See :func:`photo_collage`.
 
     Args:
@@ -139,6 +136,8 @@ class PhotoCollages(SceneDataset):
         (1000, torch.Size([3, 48, 64]), 'photo collage 0/7')
     """
 
+    kind = key = "photo collage"
+
     def __init__(
         self,
         photographs: Sequence[str | os.PathLike[str]],
@@ -150,30 +149,14 @@ class PhotoCollages(SceneDataset):
         seed: int = 0,
         transform: Transform | None = None,
     ) -> None:
-        super().__init__(transform)
-        if not isinstance(length, Integral) or length < 1:
-            raise ValueError(f"length must be a positive integer, got {length!r}")
+        super().__init__(length, height, width, depth_range=depth_range, seed=seed, transform=transform)
         if not photographs:
             raise ValueError("photographs must hold one path or more, got none")
-        check_arguments(height, width, depth_range, 1, seed)
         self.photographs = [Path(path) for path in photographs]
-        self.length, self.height, self.width = length, height, width
-        self.depth_range, self.seed = depth_range, seed
 
-    def __len__(self) -> int:
-        """Return the number of scenes."""
-        return self.length
-
-    def name(self, index: int) -> str:
-        """Return the seed and the number of a scene."""
-        return f"photo collage {self.seed}/{index}"
-
-    def read(self, index: int) -> Scene:
-        """Paint a scene."""
-        seed = keyed_seed(self.seed, "photo collage", index)
-        size = (self.height, self.width)
-        image, depth = photo_collage(self.photographs, *size, depth_range=self.depth_range, seed=seed)
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+    def paint(self, seed: int) -> tuple[Tensor, Tensor]:
+        """Return image and depth of the scene of a seed."""
+        return photo_collage(self.photographs, self.height, self.width, depth_range=self.depth_range, seed=seed)
 
 
 def photographs_in(folder: str | os.PathLike[str]) -> list[Path]:

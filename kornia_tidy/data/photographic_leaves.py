@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from numbers import Integral
-
 import cv2
 import numpy as np
 import torch
@@ -12,11 +10,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_tidy.data.dead_leaves import check_arguments, depth_of, rasterise, scatter_leaves
+from kornia_tidy.data.dead_leaves import PaintedScenes, check_arguments, depth_of, rasterise, scatter_leaves
 from kornia_tidy.data.photographic_textures import photographic_light
-from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.seeds import keyed_seed
 
 ZOOM = 2  # painted pixels along a side of a final one
 PIXELS_A_LEAF = (150.0, 6000.0)  # of the final picture, uniform in its logarithm over the scenes: few or many objects
@@ -82,7 +77,7 @@ def photographic_leaves(
     return encoded.clamp(0, 1), torch.from_numpy(depth[None])
 
 
-class PhotographicLeaves(SceneDataset):
+class PhotographicLeaves(PaintedScenes):
     """Data set of dead-leaves scenes with the statistics of photographs. See :func:`photographic_leaves`.
 
     Args:
@@ -102,36 +97,11 @@ class PhotographicLeaves(SceneDataset):
         (1000, torch.Size([3, 48, 64]), 'photographic leaves 0/7')
     """
 
-    def __init__(
-        self,
-        length: int,
-        height: int,
-        width: int,
-        *,
-        depth_range: tuple[float, float] = (0.3, 10.0),
-        seed: int = 0,
-        transform: Transform | None = None,
-    ) -> None:
-        super().__init__(transform)
-        if not isinstance(length, Integral) or length < 1:
-            raise ValueError(f"length must be a positive integer, got {length!r}")
-        check_arguments(height, width, depth_range, 1, seed)
-        self.length, self.height, self.width = length, height, width
-        self.depth_range, self.seed = depth_range, seed
+    kind, key = "photographic leaves", "photographic scene"
 
-    def __len__(self) -> int:
-        """Return the number of scenes."""
-        return self.length
-
-    def name(self, index: int) -> str:
-        """Return the seed and the number of a scene."""
-        return f"photographic leaves {self.seed}/{index}"
-
-    def read(self, index: int) -> Scene:
-        """Paint a scene."""
-        seed = keyed_seed(self.seed, "photographic scene", index)
-        image, depth = photographic_leaves(self.height, self.width, depth_range=self.depth_range, seed=seed)
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+    def paint(self, seed: int) -> tuple[Tensor, Tensor]:
+        """Return image and depth of the scene of a seed."""
+        return photographic_leaves(self.height, self.width, depth_range=self.depth_range, seed=seed)
 
 
 def photographed(light: NDArray[np.float32], rng: Generator) -> NDArray[np.float32]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
-from typing import Any
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.choices import PRETRAINED, REPLACED
-from kornia_tidy.files import read_bytes
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.measured import closed_form_system, with_measurements
 from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system
@@ -65,10 +62,3 @@ def load_system(
     assert head is not None
     system = saved_system(head_file(head), sensor)
     return system if measured is None and sensor is None else with_measurements(system, measured, sensor)
-
-
-def digests(head: str | None, *files: str | float | None) -> dict[str, Any]:
-    """Return the ingredients of a system, to recognise its results: digests of files, and numbers."""
-    named = () if head is None or head in CLOSED_FORMS else (str(head_file(head)),)
-    read = [hashlib.sha256(read_bytes(f)).hexdigest() if isinstance(f, str) else f for f in (*named, *files)]
-    return {"head": head, "files": read}

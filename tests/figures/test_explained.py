@@ -23,13 +23,13 @@ class TestExplain(BaseTester):
     @pytest.mark.parametrize(("masks", "channels", "height"), [(5, 3, 64), (2, 1, 120), (7, 3, 80)])
     def test_feature_no_text_leaves_the_picture_or_covers_another(self, masks, channels, height):
         figure = figure_of(TiDyOptics(PixelwiseMask(masks), fidelity=QUICK), height=height, channels=channels)
-        ticks = [label for axes in figure.axes for label in axes.get_xticklabels()]
-        assert len(check_texts(figure, [*figure.texts, *ticks])) > 25
+        words = [text for part in (figure, *figure.subfigs) for text in part.texts]
+        assert len(check_texts(figure, [*words, *(axes.title for axes in figure.axes)])) > 15
 
     @pytest.mark.takes_seconds
     def test_feature_all_five_masks_and_six_rows_of_psfs_are_drawn(self):
         figure = figure_of(TiDyOptics(PixelwiseMask(5), fidelity=QUICK))
-        pictures = [axes.images[0].get_array().shape for axes in figure.axes]
+        pictures = [axes.images[0].get_array().shape for axes in figure.axes if axes.images]
         assert sum(shape == (23, 23) for shape in pictures) == 5
         assert sum(shape == (23, 23, 3) for shape in pictures) == 6 * 7
         assert sum(shape[:2] == (64, 80) for shape in pictures) == 4
@@ -37,14 +37,12 @@ class TestExplain(BaseTester):
 
     def test_feature_of_a_longer_mask_the_part_over_the_pupil_is_drawn(self):
         figure = figure_of(TiDyOptics(PixelwiseMask(2, size=(23, 41)), fidelity=QUICK))
-        assert sum(axes.images[0].get_array().shape == (23, 23) for axes in figure.axes) == 2
+        assert sum(image.get_array().shape == (23, 23) for axes in figure.axes for image in axes.images) == 2
 
     def test_feature_headers_run_from_near_to_infinity(self):
         figure = figure_of(TiDyOptics(PixelwiseMask(2), fidelity=QUICK))
-        words = [t.get_text() for t in figure.texts]
-        depths = [w for w in words if w.endswith(" m")]
-        assert (depths[0], depths[3], depths[-1]) == ("0.3 m", "0.59 m", "∞ m")
-        assert [w for w in words if w.startswith("ψ")][0::6] == ["ψ = +20", "ψ = −20"]
+        heads = [axes.get_title() for axes in figure.axes if "ψ" in axes.get_title()]
+        assert (heads[0], heads[3], heads[-1]) == ("0.3 m\nψ = +20", "0.59 m\nψ = 0", "∞ m\nψ = -20")
 
     def test_exception_without_matplotlib_says_what_to_install(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

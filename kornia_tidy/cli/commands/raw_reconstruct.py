@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from kornia_tidy.choices import LENSES, ORIENTATIONS, PRETRAINED
+from kornia_tidy.choices import ORIENTATIONS, PRETRAINED
 from kornia_tidy.cli.commands.lens_option import RealLens, camera_and_lens
 from kornia_tidy.cli.commands.raw_develop import SUFFIXES, Format
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
@@ -68,7 +68,7 @@ class ReconstructRaw:
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
-        resume: skip files with valid results.
+        resume: skip files whose results are complete, whatever they were made with.
         format: of the 16-bit picture.
         depth_unit: of FILE_depth.png.
         linear: FILES that are pictures hold linear light, not sRGB.
@@ -179,7 +179,8 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             return capture
 
         words = {"head": self.head or ANY_CAMERA} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
-        words |= {"lens": self.lens} if self.lens else {}
+        words |= {name: str(value) for name, value in self._given().items()}
+        words |= {name: getattr(self, name) for name in ("linear", "overlap", "orientations", "white_balance")}
         folder = Path(self.output)
         rows = reconstruct_files(
             self.files,
@@ -187,7 +188,6 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             head,
             read,
             words=words,
-            made_by=self._made_by(),
             resume=self.resume,
             picture=SUFFIXES[self.format],
             depth_unit=self.depth_unit,
@@ -262,19 +262,3 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             sensor=sensor,
             calibration=calibration,
         )
-
-    def _made_by(self) -> dict[str, Any]:
-        """Return what results depend on beside their file, to recognise them on resuming."""
-        from kornia_tidy.lab.named_system import digests
-
-        given = self._given()
-        files = [given[name] for name in ("masks", "lens") if isinstance(given.get(name), str)]
-        return {
-            "system": digests(self.head, self.psfs, self.noise, *(file for file in files if file not in LENSES)),
-            "depth_unit": self.depth_unit,
-            "linear": self.linear,
-            "overlap": self.overlap,
-            "orientations": self.orientations,
-            "white_balance": self.white_balance or None,
-            "dump": {name: value or None for name, value in vars(self.dump).items()},
-        } | ({"camera": {name: str(value) for name, value in given.items()}} if given else {})
