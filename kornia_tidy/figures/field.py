@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import Tensor
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH, PLOTS, HEAD, FOOT, BETWEEN = 12.8, 2.9, 1.2, 0.5, 0.35  # inches
-LEFT, GAP, RIGHT = 1.05, 0.3, 0.15  # inches
-HEADLINE, LABEL, SMALL = 13, 9, 8  # pt
-CELL = 1.2  # inches, at most
+WIDTH, PLOTS, CELL = 12.8, 3.0, 1.2  # inches
+LABEL, SMALL = 9, 8  # pt
 PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}  # behind words on rays
 HELD = 0.95  # share of the light in the window that a cell of the montage shows
 
@@ -77,34 +75,24 @@ def draw_field(measured: FieldMeasures, airy: float) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     (rows, columns), sides = measured.psfs.shape[:2], _sides(measured)
-    block = (WIDTH - LEFT - GAP - RIGHT) / 2
-    cell = min(CELL, block / columns)
-    height = HEAD + cell * rows + BETWEEN + PLOTS + FOOT
-    figure = Figure(figsize=(WIDTH, height), facecolor="white")
-    figure.text(0.2 / WIDTH, 1 - 0.36 / height, measured.lens, fontsize=HEADLINE, color=INK, weight="bold")
-    words = (
-        f"field points right of the axis, pixels of {1e6 * measured.pitch:.3g} µm; each colour about its own chief ray"
-    )
-    figure.text(1 - RIGHT / WIDTH, 1 - 0.36 / height, words, fontsize=LABEL, color=FAINT, ha="right")
-    titles = (
-        "PSFs, square root of the light, grey: beyond the window",
-        "spot diagram, rays without masks, circle: Airy disc at 530 nm",
-    )
-    for number, title in enumerate(titles):
-        left = LEFT + number * (block + GAP)
-        figure.text(left / WIDTH, 1 - 0.7 / height, title, fontsize=LABEL + 1, color=INK)
-        for f in range(rows):
-            for d in range(columns):
-                bottom = height - HEAD - cell * (f + 1)
-                place = (left + cell * d) / WIDTH, bottom / height, 0.96 * cell / WIDTH, 0.96 * cell / height
-                axes = figure.add_axes(place)
-                (_spots if number else _psf)(axes, measured, f, d, airy)
-                _frame(axes, measured, f, d, sides[d], dark=not number)
-                if number == 0 and d == 0:
-                    _name_row(axes, measured, f)
-    tall, wide, apart = PLOTS / height, 0.262, 0.335
-    for number, chart in enumerate((_over_field, _over_depth, _over_colour)):
-        axes = figure.add_axes((0.055 + apart * number, FOOT / height, wide, tall - 0.3 / height))
+    tall = CELL * (rows + 1)
+    figure = Figure(figsize=(WIDTH, tall + PLOTS), facecolor="white", layout="constrained")
+    words = f"field points right of the axis, pixels of {1e6 * measured.pitch:.3g} µm; each colour about its chief ray"
+    figure.suptitle(f"{measured.lens}: {words}", fontsize=LABEL + 2, color=INK)
+    above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))
+    parts = {
+        "PSFs, square root of the light, grey: beyond the window": _psf,
+        "spot diagram, rays without masks, circle: Airy disc at 530 nm": _spots,
+    }
+    for half, (title, draw) in zip(above.subfigures(1, 2), parts.items(), strict=True):
+        half.suptitle(title, fontsize=LABEL + 1, color=INK)
+        for f, row in enumerate(half.subplots(rows, columns, squeeze=False)):
+            for d, axes in enumerate(row):
+                draw(axes, measured, f, d, airy)
+                _frame(axes, measured, f, d, sides[d], dark=draw is _psf)
+            if draw is _psf:
+                _name_row(row[0], measured, f)
+    for axes, chart in zip(below.subplots(1, 3), (_over_field, _over_depth, _over_colour), strict=True):
         chart(axes, measured)
         _finish(axes)
     return figure
@@ -145,16 +133,7 @@ def _spots(axes: Axes, measured: FieldMeasures, f: int, d: int, airy: float) -> 
     turn = torch.linspace(0, 2 * math.pi, 100)
     axes.plot(airy * turn.cos(), airy * turn.sin(), color=INK, linewidth=0.7)
     worst = float(measured.spread[f, d].max())
-    axes.text(
-        0.96,
-        0.04,
-        f"rms {worst:.2g} px",
-        transform=axes.transAxes,
-        fontsize=SMALL - 1,
-        color=INK,
-        ha="right",
-        bbox=PAPER,
-    )
+    axes.set_xlabel(f"rms {worst:.2g} px", fontsize=SMALL - 1, color=INK)
 
 
 def _frame(axes: Axes, measured: FieldMeasures, f: int, d: int, half: float, *, dark: bool) -> None:

@@ -29,8 +29,9 @@ class TestDrawLens(BaseTester):
         shown = PixelwiseMask(masks) if masks else NoMask()
         figure = draw_lens(TiDyOptics(shown, lens="single-50mm", fidelity="draft"), field=3)
         words = [text for axes in figure.axes for text in (axes.title, axes.xaxis.label, axes.yaxis.label)]
-        # Titles, depths, heights, charts with their axes.
-        assert len(check_texts(figure, [*figure.texts, *words])) == 4 + 10 + 3 + 9
+        words += [text for part in (figure, *figure.subfigs[0].subfigs) for text in part.texts]
+        # Titles, depths, heights, spreads, charts with their axes.
+        assert len(check_texts(figure, words)) == 3 + 10 + 3 + 15 + 9
         assert len(figure.axes) == 2 * 3 * 5 + 3
 
     def test_feature_one_colour_and_one_height_are_drawn_too(self, tmp_path):
