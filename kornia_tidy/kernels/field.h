@@ -35,7 +35,7 @@ INLINE int has_order(const field *f, int64_t row, int64_t column, int order) {
     return order == VALUE || any(f->row_weights + (2 * row + 1) * f->node_rows, f->node_rows);
 }
 
-static void begin_row(lines *l, int64_t row) {
+static inline void begin_row(lines *l, int64_t row) {
     if (l->row == row) return;
     l->row = row;
     memset(l->made, 0, l->slots);
@@ -53,9 +53,11 @@ INLINE vec *line_at(const lines *l, int64_t slot, int slope) {
     return l->lines + (slot * 2 + slope) * l->f->node_columns * l->vectors;
 }
 
+enum { AHEAD = 4096 / sizeof(REAL) };  // numbers that are asked for before they are read
+
 // Blends the nodes of a plane along their columns, `next` numbers from node to node, if this row has not yet done it. Nodes
 // come from far memory: each is read once, from its begin to its end, two at a time.
-static void blend_nodes(lines *l, int64_t slot, const REAL *nodes, int64_t next, REAL scale) {
+static inline void blend_nodes(lines *l, int64_t slot, const REAL *nodes, int64_t next, REAL scale) {
     const field *f = l->f;
     if (l->made[slot]) return;
     l->made[slot] = 1;
@@ -69,6 +71,7 @@ static void blend_nodes(lines *l, int64_t slot, const REAL *nodes, int64_t next,
             const REAL v = weights[row] * scale, u = two ? weights[row + 1] * scale : 0;
             const REAL s = slopes[row] * scale, t = two ? slopes[row + 1] * scale : 0;
             for (int64_t n = 0, k = 0; n < l->vectors; n++, k += LANES) {
+                __builtin_prefetch(a + k + AHEAD), __builtin_prefetch(b + k + AHEAD);
                 const vec x = load_some(a + k, l->numbers - k), y = load_some(b + k, l->numbers - k);
                 value[n] = v * x + u * y + (row ? value[n] : all(0));
                 if (sloped) slope[n] = s * x + t * y + (row ? slope[n] : all(0));
@@ -78,7 +81,7 @@ static void blend_nodes(lines *l, int64_t slot, const REAL *nodes, int64_t next,
 }
 
 // Blends the line of a slot for a tile: `psf` is (ORDERS, vectors).
-static void blend_line(const lines *l, int64_t slot, int64_t column, vec *psf) {
+static inline void blend_line(const lines *l, int64_t slot, int64_t column, vec *psf) {
     const field *f = l->f;
     const int along_x = has_order(f, l->row, column, ALONG_X), along_y = has_order(f, l->row, column, ALONG_Y);
     const REAL *weights = f->column_weights + 2 * column * f->node_columns, *slopes = weights + f->node_columns;
@@ -95,7 +98,7 @@ static void blend_line(const lines *l, int64_t slot, int64_t column, vec *psf) {
 }
 
 // The transpose: adds the gradients of a tile's PSF to those of its line, which it clears when it is the first.
-static void spread_tile(lines *l, int64_t slot, int64_t column, const vec *psf) {
+static inline void spread_tile(lines *l, int64_t slot, int64_t column, const vec *psf) {
     const field *f = l->f;
     const REAL *weights = f->column_weights + 2 * column * f->node_columns, *slopes = weights + f->node_columns;
     vec *value = line_at(l, slot, 0), *slope = line_at(l, slot, 1);
@@ -109,7 +112,7 @@ static void spread_tile(lines *l, int64_t slot, int64_t column, const vec *psf) 
 }
 
 // Adds the gradients of a slot's line to those of a plane at the nodes, `next` vectors from node to node.
-static void spread_line(const lines *l, int64_t slot, vec *nodes, int64_t next) {
+static inline void spread_line(const lines *l, int64_t slot, vec *nodes, int64_t next) {
     const field *f = l->f;
     if (!l->made[slot]) return;
     for (int64_t n = 0; n < f->node_rows * f->node_columns; n++, nodes += next) {
@@ -119,7 +122,7 @@ static void spread_line(const lines *l, int64_t slot, vec *nodes, int64_t next) 
     }
 }
 
-static int take_lines(const field *f, int64_t slots, int64_t numbers, lines *l) {
+static inline int take_lines(const field *f, int64_t slots, int64_t numbers, lines *l) {
     const int64_t vectors = (numbers + LANES - 1) / LANES;
     *l = (lines){f, numbers, vectors, 0, 0, slots, -1};
     if (!f->node_rows) return 1;
@@ -128,4 +131,4 @@ static int take_lines(const field *f, int64_t slots, int64_t numbers, lines *l) 
     return l->lines && l->made;
 }
 
-static void free_lines(lines *l) { free(l->lines), free(l->made); }
+static inline void free_lines(lines *l) { free(l->lines), free(l->made); }

@@ -309,15 +309,6 @@ static void add_edges(const scene_parameters *s, const double *table, const regi
 
 // ---- Masked rows.
 
-INLINE vec only(vec x, __typeof__((vec){0} == (vec){0}) mask) {
-    union {
-        vec x;
-        __typeof__((vec){0} == (vec){0}) bits;
-    } masked = {.x = x};
-    masked.bits &= mask;
-    return masked.x;
-}
-
 enum { LIGHT, LOWER, UPPER };
 
 // Masks rows of light to a layer, or computes the rows of its shared weights, where the layer is present.
@@ -329,10 +320,10 @@ INLINE void mask_rows(const scene_parameters *s, const ray *rays, int32_t layer,
         const REAL *l = lower + r * s->map_row, *f = share ? share + r * s->map_row : 0, *x = light + r * s->plane_row;
         for (int64_t j = 0;; j = least(j + LANES, s->side - 1)) {  // the last two vectors overlap
             vec at = *(const loose *)(l + j), weight;
-            if (what == LIGHT && !share) weight = only(*(const loose *)(x + j), at == own);
+            if (what == LIGHT && !share) weight = where(at == own, *(const loose *)(x + j));
             else {
                 vec t = *(const loose *)(f + j);
-                vec upper = only(t, at == below), rest = only(1 - t, what == LOWER ? (at == own) & (t > 0) : at == own);
+                vec upper = where(at == below, t), rest = where(what == LOWER ? (at == own) & (t > 0) : at == own, 1 - t);
                 weight = what == LIGHT ? (upper + rest) * *(const loose *)(x + j) : what == LOWER ? rest : upper;
             }
             *(loose *)(out + r * pitch + j) = weight;
@@ -497,7 +488,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
             REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
             REAL glow = s->veil ? veil * s->mean[image * s->channels + c] : 0;
             for (int v = 0; v < BAND; v++) {
-                vec passed = through[c][v] / (only(seen[0][v], seen[0][v] > 0) + EPSILON);
+                vec passed = through[c][v] / (where(seen[0][v] > 0, seen[0][v]) + EPSILON);
                 if (s->over.node_rows) light[0][v] *= lit[v];
                 total[c][v] += passed * ((1 - veil) * light[0][v] + glow * own[0][v]);
                 through[c][v] -= passed * own[0][v];
@@ -787,7 +778,7 @@ static void keep_layers(const scene_parameters *s, workspace *d, const double *t
             vec(*k)[BAND] = d->kept[n * s->channels + c];
             blur_layer(s, d, tables, b, n, c, k + BLURRED, k + ALPHA, k + CUMULATIVE, k[LIT]);
             for (int v = 0; v < BAND; v++) {
-                k[DIVISOR][v] = only(k[CUMULATIVE][v], k[CUMULATIVE][v] > 0) + EPSILON;
+                k[DIVISOR][v] = where(k[CUMULATIVE][v] > 0, k[CUMULATIVE][v]) + EPSILON;
                 k[PASSED][v] = through[c][v] / k[DIVISOR][v];
                 through[c][v] -= k[PASSED][v] * k[ALPHA][v];
             }
@@ -820,7 +811,7 @@ static void turn_back(const scene_parameters *s, workspace *d, tally *t, const b
                 k[BLURRED][v] = (1 - veil) * gradient[v] * passed * lit;
                 k[LIT][v] = (1 - veil) * gradient[v] * passed * blurred;
                 k[ALPHA][v] = passed * (veil * mean * gradient[v] - through[c][v]);
-                k[CUMULATIVE][v] = only(-of_passed * passed / divisor, divisor > EPSILON);
+                k[CUMULATIVE][v] = where(divisor > EPSILON, -of_passed * passed / divisor);
                 through[c][v] += of_passed / divisor;
             }
             t->veil[plane] += sum_of(of_veil);

@@ -395,16 +395,6 @@ static void read_labels(const work *w, tile t, desk *d) {
     cut(w, weight, s->weight_row, t.height, t.width, s->origin, d->weight);
 }
 
-// The numbers where a condition holds, and zeros elsewhere.
-INLINE vec where(__typeof__((vec){0} == (vec){0}) holds, vec x) {
-    union {
-        vec x;
-        __typeof__((vec){0} == (vec){0}) bits;
-    } masked = {.x = x};
-    masked.bits &= holds;
-    return masked.x;
-}
-
 // The share of a layer in samples with some labels and, where the scene has them, weights of the next layer.
 INLINE vec share(const tiles *s, vec label, const vec *weight, int64_t layer) {
     const vec one = 1 - (vec){0};

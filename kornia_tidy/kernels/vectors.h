@@ -56,6 +56,9 @@ INLINE vec choose(bits condition, vec yes, vec no) {
     return real_of((bits_of(yes) & condition) | (bits_of(no) & ~condition));
 }
 
+// The numbers where a condition holds, and zeros elsewhere.
+INLINE vec where(bits condition, vec x) { return real_of(bits_of(x) & condition); }
+
 INLINE vec polynomial(const REAL *coefficients, int degree, vec x) {
     vec sum = all(coefficients[degree]);
 #pragma GCC unroll 4
