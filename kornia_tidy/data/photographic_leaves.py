@@ -35,7 +35,7 @@ def photographic_leaves(
       (:math:`f^{-2.9}`); stripes, writing and other patterns are few;
     - light: shapes are shaded smoothly, and the illumination varies smoothly over the scene.
 
-    ``tests/benchmarks/scene_likeness.py`` measures how like photographs the scenes are.
+    ``docs/record/benchmarks.md`` tells how like photographs the scenes are.
 
     Args:
         height: rows in pixels.

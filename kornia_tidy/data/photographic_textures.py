@@ -20,7 +20,7 @@ from kornia_tidy.data.leaf_textures import (
 
 # Natural logarithms of linear light: mean and standard deviation of a scene's mean, standard deviation of its leaves
 # around that. These and the sizes of textures were set by hand to bring the statistics of 16 photographs, half A of
-# tests/benchmarks/scene_likeness.py.
+# the real scenes (docs/record/benchmarks.md).
 LUMINANCE = (-1.95, 0.6, 0.85)
 RED_OVER_BLUE = (0.5, 0.35, 0.5)
 GREEN_OVER_MAGENTA = (0.0, 0.2, 0.25)

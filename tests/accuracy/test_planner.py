@@ -331,10 +331,9 @@ class TestPlan(BaseTester):
         assert "states" not in str(other)
         assert plan.operations > 2 * other.operations
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_memory_layout_of_depth_does_not_matter(self, compositing):
+    def test_feature_memory_layout_of_depth_does_not_matter(self):
         depth = torch.linspace(0.4, 3, 48 * 64).view(1, 48, 64)
-        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None, compositing=compositing, border="valid")
+        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None, border="valid")
         turned = depth.mT.contiguous().mT
         assert optics.plan(turned, tolerance=1e-2) == optics.plan(depth, tolerance=1e-2)
 

@@ -39,13 +39,10 @@ class TestBurst(BaseTester):
         assert burst(camera(1), image[0], depth[0], dead_time=5.0).shape == (1, 3, 24, 20)
         assert burst(camera(border="valid"), image, depth).shape == (2, 3, 3, 16, 12)
 
-    @pytest.mark.parametrize("modulator", [None, DwellTimes((1, 2, 3)), Switching(8e-3, dwell=DwellTimes((3, 1, 1)))])
-    def test_feature_without_noise_the_shots_add_up_to_the_exposure_less_the_pauses(self, modulator):
-        optics, (image, depth) = camera(modulator=modulator), scene(torch.float64)
-        ideal = camera(modulator=modulator.dwell if isinstance(modulator, Switching) else modulator)
-        ideal.masks = optics.masks
+    def test_feature_without_noise_the_shots_add_up_to_the_exposure_less_the_pauses(self):
+        optics, (image, depth) = camera(modulator=DwellTimes((1, 2, 3))), scene(torch.float64)
         with torch.no_grad():
-            shots, averaged = burst(optics, image, depth, dead_time=7e-3), ideal(image, depth)
+            shots, averaged = burst(optics, image, depth, dead_time=7e-3), optics(image, depth)
         self.assert_close(shots.sum(1), averaged * (1 - 2 * 7e-3 / 0.1), rtol=0, atol=1e-7)
 
     def test_feature_each_shot_is_that_of_its_mask(self):

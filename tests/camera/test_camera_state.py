@@ -23,7 +23,6 @@ from kornia_tidy.optics import FUSED_SILICA, SYSTEMS
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
 
@@ -112,20 +111,6 @@ class TestTheSameCamera(BaseTester):
             changed += before != optics.fit_window()
         assert changed >= 6
 
-    @pytest.mark.slow
-    def test_feature_forty_steps_of_adam_are_restored(self):
-        optics = preset("tidy-5")
-        adam = torch.optim.Adam(optics.parameter_groups(1e-8), betas=(0.99, 0.999))
-        for _ in range(40):
-            adam.zero_grad()
-            (optics(*scene(optics)) - IMAGE).square().mean().backward()
-            adam.step()
-        before, window = capture(optics), optics.window
-        assert copy.deepcopy(optics).fit_window() < window
-        optics.load_state_dict(optics.state_dict())
-        assert optics.window == window
-        assert torch.equal(capture(optics), before)
-
     def test_feature_windows_of_any_size_fill_the_same_bytes(self):
         """So that distributed checkpoints, which read into tensors of one size, can be read."""
         optics = preset("tidy-5")
@@ -188,12 +173,6 @@ class TestTheSameCamera(BaseTester):
             fresh.load_state_dict(stored(average.state_dict(), "torch"))
             camera, other = (next(m for m in x.modules() if isinstance(m, TiDyOptics)) for x in (average, fresh))
             assert torch.equal(capture(camera), capture(other))
-
-    def test_feature_a_file_of_training(self, tmp_path):
-        optics, other = trained(small()), small()
-        write_state(tmp_path / "a.safetensors", {"state_dict": optics.state_dict()})
-        other.load_state_dict(read_state(tmp_path / "a.safetensors")["state_dict"])
-        assert torch.equal(capture(optics), capture(other))
 
     def test_feature_all_kinds_of_parts(self):
         def make():

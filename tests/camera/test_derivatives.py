@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
-from torch.func import functional_call, grad, jacrev, jvp, vmap
+from torch.func import functional_call, grad, jvp, vmap
 
 from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
 from kornia_tidy.kernels.build import compiled
@@ -93,10 +93,9 @@ class TestSecondDerivatives(BaseTester):
     """
 
     @pytest.mark.parametrize("fidelity", FIDELITIES.values(), ids=FIDELITIES)
-    @pytest.mark.parametrize("loss", ["linear", "square"])
     @over_compositing
-    def test_feature_they_are_those_of_the_capture(self, compositing, loss, fidelity):
-        self.check(camera(compositing, fidelity), loss, *scene())
+    def test_feature_they_are_those_of_the_capture(self, compositing, fidelity):
+        self.check(camera(compositing, fidelity), "linear", *scene())
 
     @pytest.mark.filterwarnings("ignore::kornia_tidy.psf.paper.AliasingWarning")
     def test_feature_of_the_papers_discretisation(self):
@@ -251,20 +250,6 @@ class TestTransformsOfTorch(BaseTester):
             vmap(lambda i: optics(i, depth))(image[None])
             assert torch.equal(optics(image, depth), untouched(image, depth))
         assert optics.clamped_pixels == 48
-
-    def test_feature_jacrev_of_a_few_pixels(self, compositing):
-        optics, (image, depth) = camera(compositing), scene()
-        masks = masks_of(optics)
-
-        def pixels(masks):
-            return functional_call(optics, masks, (image, depth))[0, :, 6, 9]
-
-        found = jacrev(pixels)(masks)["masks.phase"]
-        leaves = masks_of(optics)
-        leaf = leaves["masks.phase"].requires_grad_()
-        for row, pixel in zip(found, pixels(leaves), strict=True):
-            (own,) = torch.autograd.grad(pixel, leaf, retain_graph=True)
-            self.assert_close(row, own, rtol=0, atol=1e-10 * float(own.abs().max()))
 
 
 @pytest.mark.filterwarnings("ignore:.torch.jit:DeprecationWarning")

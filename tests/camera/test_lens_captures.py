@@ -17,6 +17,7 @@ from kornia_tidy.camera import camera_of_state
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
 from kornia_tidy.psf import PSFBank
+from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import render
 from tests.base import BaseTester, shared
 
@@ -64,8 +65,9 @@ PIXELS = [(0, 0), (35, 50), (63, 64), (71, 99), (20, 81)]
 
 
 class TestLensCaptures(BaseTester):
-    @pytest.mark.parametrize("border", ["reflect", "zero", "circular", "replicate", "valid"])
-    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
+    @pytest.mark.parametrize(
+        ("compositing", "border"), [*(("gather", border) for border in BORDERS), ("occlusion", "zero")]
+    )
     @torch.no_grad()
     def test_feature_a_pixel_sees_through_the_psf_of_its_place(self, compositing, border):
         """The whole picture is rendered through one pixel's PSFs, which must give that pixel."""
@@ -168,8 +170,10 @@ class TestLensCaptures(BaseTester):
             assert 0.9 < float(light.min()) < 0.99  # this far off the axis
             self.assert_close(seen[0, :, y, x], light, rtol=0, atol=1e-4)
 
-    @pytest.mark.parametrize("border", ["reflect", "valid"])
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.parametrize(
+        ("compositing", "border"),
+        [("gather", "reflect"), ("gather", "valid"), ("scatter", "reflect"), ("occlusion", "reflect")],
+    )
     @torch.no_grad()
     def test_feature_strips_batches_copies_and_captures_before(self, compositing, border):
         optics, (image, depth) = camera(compositing, border, center=(450.0, 520.0)), scene(136, 60)
@@ -191,26 +195,23 @@ class TestLensCaptures(BaseTester):
         part = optics(image[..., 40:, 60:], depth[..., 40:, 60:])
         self.assert_close(part, whole[..., 40:, 60:], rtol=0, atol=1e-3)
 
-    @pytest.mark.parametrize("form", ["argument", "mapping", "strips", "dataset"])
     @torch.no_grad()
-    def test_feature_each_image_of_a_batch_has_its_place(self, form):
+    def test_feature_each_image_of_a_batch_has_its_place(self):
+        """As an argument, in a mapping, in strips and in a data set."""
         scenes, places = [scene(136, 40, seed) for seed in range(3)], [(450.0, 520.0), (0.0, -20.0), (450.0, 520.0)]
         alone = [camera(center=center)(*one) for one, center in zip(scenes, places, strict=True)]
-        optics = camera(center=(0.0, 0.0))
+        optics, centers = camera(center=(0.0, 0.0)), torch.tensor(places)
         image, depth = (torch.cat(parts) for parts in zip(*scenes, strict=True))
-        if form == "strips":
-            optics.memory_budget = 1
-        if form in ("argument", "strips"):
-            seen = optics(image, depth, field_center=torch.tensor(places))
-        elif form == "mapping":
-            seen = optics({"image": image, "depth": depth, "field_center": torch.tensor(places)})["image"]
-        else:
-            transform = optics.as_transform()
-            given = zip(image, depth, torch.tensor(places), strict=True)
-            samples = [{"image": x, "depth": d[0].numpy(), "field_center": c} for x, d, c in given]
-            seen = torch.stack([transform(sample)["image"] for sample in samples])
-        self.assert_close(seen, torch.cat(alone), rtol=0, atol=1e-5)
         assert float((alone[0] - optics(*scenes[0])).abs().max()) > 0.02
+        seen = [optics(image, depth, field_center=centers)]
+        seen.append(optics({"image": image, "depth": depth, "field_center": centers})["image"])
+        given = zip(image, depth, centers, strict=True)
+        samples = [{"image": x, "depth": d[0].numpy(), "field_center": c} for x, d, c in given]
+        seen.append(torch.stack([optics.as_transform()(sample)["image"] for sample in samples]))
+        optics.memory_budget = 1
+        seen.append(optics(image, depth, field_center=centers))
+        for captures in seen:
+            self.assert_close(captures, torch.cat(alone), rtol=0, atol=1e-5)
 
     @torch.no_grad()
     def test_feature_noise_does_not_depend_on_whether_places_differ(self):
@@ -340,13 +341,13 @@ class TestLensCaptures(BaseTester):
 
     @torch.no_grad()
     def test_feature_threads_with_pictures_of_other_sizes(self):
-        optics, scenes = camera(center=(450.0, 520.0)), [scene(24, 24 + 2 * i, seed=i) for i in range(4)]
+        optics, scenes = camera(center=(450.0, 520.0)), [scene(24, 24 + 2 * i, seed=i) for i in range(3)]
         alone = [camera(center=(450.0, 520.0))(*each) for each in scenes]
         with ThreadPoolExecutor(4) as pool:
             take = torch.no_grad()(lambda each: optics(*each))  # a thread records gradients unless it is told
-            together = list(pool.map(take, scenes * 3))
+            together = list(pool.map(take, scenes * 2))
         for i, capture in enumerate(together):
-            self.assert_close(capture, alone[i % 4], rtol=0, atol=1e-6)
+            self.assert_close(capture, alone[i % 3], rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize(
         ("center", "error", "message"),

@@ -115,7 +115,7 @@ class TestBurstOfEveryModulator(BaseTester):
     def between(self, modulator):
         return sum(timeline_of(modulator, torch.zeros(3, 7, 7, dtype=torch.float64)).durations[3:].tolist())
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
     def test_feature_shots_add_up_to_the_exposure(self, modulator, compositing):
         """And moments too: what is between masks is hidden in a burst, so there it is taken out of the exposure."""
         optics, (image, depth) = camera(modulator, compositing=compositing), scene()
@@ -129,7 +129,7 @@ class TestBurstOfEveryModulator(BaseTester):
             masks = durations[:3].sum()
         self.assert_close(total * masks + between, exposure, rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
     def test_feature_a_scene_at_rest_is_the_ordinary_capture(self, modulator, compositing):
         optics, (image, depth) = camera(modulator, compositing=compositing), scene()
         with torch.no_grad():

@@ -26,13 +26,6 @@ from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0, stray_light="discard")
-MODULATORS = {
-    "dwell": DwellTimes((1, 2, 1)),
-    "learnable": LearnableDwellTimes((1, 2, 1)),
-    "random": Switching(8e-3),
-    "linear": Switching(8e-3, between="linear", samples=2, cyclic=True),
-    "panel": SpatialLightModulator(GreyLevels(4), DwellTimes(), fill_factor=0.9),
-}
 
 
 def camera(masks=3, modulator=None, sensor=None, **options) -> TiDyOptics:
@@ -91,16 +84,6 @@ class TestMovingCapture(BaseTester):
         assert moving_capture(camera(border="valid"), images, depths.float()).shape == (2, 3, 18, 14)
         assert moving_capture(optics, images[:, :, :1], depths.float()).shape == (2, 1, 26, 22)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    @pytest.mark.parametrize("modulator", MODULATORS.values(), ids=MODULATORS)
-    def test_feature_a_scene_at_rest_is_the_ordinary_capture(self, modulator, compositing):
-        fidelity = SMALL.replace(double=True, occlusion_states="each")
-        optics = camera(modulator=modulator, compositing=compositing, fidelity=fidelity)
-        image, depth = scene()
-        with torch.no_grad():
-            moving = moving_capture(optics, *at_rest(optics, image, depth))
-            self.assert_close(moving, optics(image, depth), rtol=0, atol=1e-12)
-
     @pytest.mark.parametrize("color_space", ["srgb", "linear"])
     def test_feature_at_rest_in_any_colour_space_with_the_same_noise(self, color_space):
         optics = camera(sensor=SensorNoise(0.02, full_well=500), color_space=color_space)
@@ -126,11 +109,6 @@ class TestMovingCapture(BaseTester):
                 self.assert_close(moving_capture(optics, *at_rest(optics, white, depth)), white, rtol=0, atol=1e-9)
         assert float(apart["veil"]) < 1e-12
         assert 1e-5 < float(apart["renormalize"]) < 0.05
-
-    def test_feature_one_mask_is_a_still_picture(self):
-        optics, (image, depth) = camera(1), scene(torch.float32)
-        with torch.no_grad():
-            assert torch.equal(moving_capture(optics, image[:, None], depth[:, None]), optics(image, depth))
 
     @pytest.mark.parametrize("stray_light", ["discard", "renormalize"])
     def test_feature_a_moving_scene_is_the_sum_of_shifted_captures_through_single_masks(self, stray_light):
@@ -161,12 +139,6 @@ class TestMovingCapture(BaseTester):
         assert bool((optics.masks.phase.grad.abs().amax((1, 2)) > 0).all())
         assert float(optics.modulator.logits.grad.abs().max()) > 0
         assert bool((images.grad.abs().amax((0, 2, 3, 4)) > 0).all())
-
-    def test_gradcheck(self):
-        optics = camera(2, fidelity=Fidelity(window=5, layer_spacing=20.0, stray_light="discard", double=True))
-        images, depths = torch.rand(1, 2, 1, 6, 6, dtype=torch.float64), torch.full((1, 2, 1, 6, 6), 0.5)
-        images.requires_grad_()
-        self.gradcheck(lambda x: moving_capture(optics, x, depths.double()), (images,))
 
     def test_feature_the_camera_stays_as_it_is(self):
         optics, (image, depth) = camera(sensor=SensorNoise(0.01)), scene(torch.float32)

@@ -104,12 +104,6 @@ class TestCallingForms(BaseTester):
         image, depth = scene()
         self.assert_close(two(image[:, :2], depth), three(image, depth)[:, :2])
 
-    def test_feature_memory_layout_does_not_matter(self):
-        optics, (image, depth) = camera(sensor=None), scene()
-        expected = optics(image, depth)
-        self.assert_close(optics(image.contiguous(memory_format=torch.channels_last), depth), expected)
-        self.assert_close(optics(image.mT.contiguous().mT, depth.mT.contiguous().mT), expected)
-
 
 def camera_like(optics: TiDyOptics, **options: Any) -> TiDyOptics:
     """A second camera with the same masks and other options."""

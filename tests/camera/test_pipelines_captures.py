@@ -59,14 +59,6 @@ class TestDepth(BaseTester):
 
 
 class TestRandomness(BaseTester):
-    def test_feature_the_global_seed_repeats_a_capture(self):
-        optics, (image, depth) = camera(), scene()
-        torch.manual_seed(1)
-        first, second = optics(image, depth), optics(image, depth)
-        torch.manual_seed(1)
-        assert torch.equal(optics(image, depth), first)
-        assert not torch.equal(first, second)
-
     def test_feature_a_generator_repeats_a_capture_and_leaves_the_global_one_alone(self):
         optics, (image, depth) = camera(), scene()
         before = torch.get_rng_state()
@@ -83,47 +75,6 @@ class TestRandomness(BaseTester):
         params = optics.draw(image)
         assert torch.equal(optics(image, depth, params=params), direct)
         assert torch.equal(optics({"image": image, "depth": depth}, params=params)["image"], direct)
-
-    def test_feature_eval_keeps_the_noise(self):
-        optics, (image, depth) = camera(color_space="linear").eval(), scene(1, height=128, width=128)
-        image = 0.25 + image / 2
-        silent = camera(masks=optics.masks, sensor=None, color_space="linear")
-        noise = (optics(image, depth) - silent(image, depth)).detach()
-        assert float(noise.std()) == pytest.approx(0.01, rel=0.02)  # 49 152 samples: one standard error is 0.3 %
-
-
-class TestTimeAverage(BaseTester):
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-    @pytest.mark.parametrize("stray_light", ["discard", "veil"])
-    def test_feature_the_mean_of_single_mask_captures_is_the_capture_of_the_sequence(
-        self, compositing, stray_light, device, dtype
-    ):
-        # Renormalised PSFs are left out: there each mask is scaled by the light of its own window.
-        options = {
-            "sensor": None,
-            "color_space": "linear",
-            "compositing": compositing,
-            "fidelity": FAST.replace(stray_light=stray_light),
-        }
-        together = camera(masks=PixelwiseMask(3), **options).to(device, dtype)
-        image, depth = (x.to(device, dtype) for x in scene())
-        mean = torch.zeros_like(image)
-        for phase in together.masks.phase.detach():
-            single = camera(masks=PixelwiseMask(1), **options).to(device, dtype)
-            single.masks.phase.data = phase[None].clone()
-            mean += single(image, depth) / 3
-        tolerance = 1e-12 if dtype == torch.float64 else 1e-5
-        self.assert_close(together(image, depth), mean, rtol=0, atol=tolerance)
-
-    def test_feature_encoding_is_not_linear_so_the_identity_needs_linear_light(self):
-        options = {"sensor": None, "fidelity": FAST.replace(stray_light="discard")}
-        together = camera(masks=PixelwiseMask(2), **options)
-        singles = [camera(masks=PixelwiseMask(1), **options) for _ in range(2)]
-        for single, phase in zip(singles, together.masks.phase.detach(), strict=True):
-            single.masks.phase.data = phase[None].clone()
-        image, depth = scene()
-        mean = sum(single(image, depth) for single in singles) / 2
-        assert (mean - together(image, depth)).abs().max() > 1e-4
 
 
 class TestGradients(BaseTester):

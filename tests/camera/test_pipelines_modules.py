@@ -1,15 +1,13 @@
 from __future__ import annotations
 
 import copy
-import io
 import pickle
 
 import pytest
 import torch
 from torch import Tensor
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from kornia_tidy import DefocusRange, DwellTimes, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy import DefocusRange, PixelwiseMask, ThinLensCamera, TiDyOptics
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
 
@@ -23,27 +21,6 @@ class TestCopies(BaseTester):
         optics.zero_grad(set_to_none=True)
         assert len(pickle.dumps(optics)) < fresh + 8_000  # the aperture, 23x23 float64, is made on the first call
 
-    def test_feature_no_tensor_in_the_camera_has_the_size_of_the_scene_after_a_call(self):
-        optics, (image, depth) = camera(), scene(1, height=128, width=128)
-        optics(image, depth)
-        buffer = io.BytesIO()
-        torch.save(optics, buffer)
-        held = [x for module in optics.modules() for x in vars(module).values() if isinstance(x, Tensor)]
-        assert max([x.untyped_storage().nbytes() for x in held], default=0) <= 8
-        assert buffer.tell() < depth.nbytes
-
-    @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-    def test_feature_a_copy_takes_the_same_picture(self, duplicate):
-        optics, (image, depth) = camera(camera=ThinLensCamera(focus_distance=torch.tensor(0.6))), scene()
-        optics(image, depth)  # a live graph and a count of clamped pixels must not be in the way
-        twin, params = duplicate(optics), optics.draw(image)
-        assert [n for n, _ in twin.named_parameters()] == ["masks.phase", "camera.focus_distance"]
-        for mine, theirs in zip(optics.parameters(), twin.parameters(), strict=True):
-            assert torch.equal(mine, theirs)
-            assert mine is not theirs
-        assert twin.window == optics.window
-        assert torch.equal(twin(image, depth, params=params), optics(image, depth, params=params))
-
     def test_feature_a_copy_is_independent(self):
         optics, (image, depth) = camera(sensor=None), scene()
         before, twin = optics(image, depth), copy.deepcopy(optics)
@@ -51,34 +28,6 @@ class TestCopies(BaseTester):
             twin.masks.phase.zero_()
         assert torch.equal(optics(image, depth), before)
         assert not torch.equal(twin(image, depth), before)
-
-    def test_feature_an_exponential_moving_average_follows_the_masks(self):
-        optics, (image, depth) = camera(sensor=None), scene()
-        average = AveragedModel(optics, multi_avg_fn=get_ema_multi_avg_fn(0.75))
-        average.update_parameters(optics)  # the first update copies
-        start = optics.masks.phase.detach().clone()
-        with torch.no_grad():
-            optics.masks.phase += 1
-        average.update_parameters(optics)
-        self.assert_close(average.module.masks.phase, start + 0.25)
-        assert average(image, depth).shape == image.shape
-
-    def test_feature_a_state_dict_goes_through_a_file(self):
-        optics, other, (image, depth) = camera(), camera(), scene()
-        buffer = io.BytesIO()
-        torch.save(optics.state_dict(), buffer)
-        buffer.seek(0)
-        assert not torch.equal(other.masks.phase, optics.masks.phase)
-        other.load_state_dict(torch.load(buffer, weights_only=True))
-        params = optics.draw(image)
-        assert torch.equal(other(image, depth, params=params), optics(image, depth, params=params))
-
-    def test_feature_loaded_masks_get_a_window_of_their_own(self):
-        wide, narrow = TiDyOptics(), TiDyOptics(masks=PixelwiseMask(5, initial="flat"))
-        expected = narrow.window
-        assert wide.window > expected
-        wide.load_state_dict(narrow.state_dict())
-        assert wide.window == expected
 
 
 def units_in_last_place(a: Tensor, b: Tensor) -> int:
@@ -98,12 +47,6 @@ class TestHalfPrecision(BaseTester):
         assert coded.dtype == low
         expected = copy.deepcopy(optics).float()(image.float(), depth.float(), params=params)
         assert units_in_last_place(coded, expected.to(low)) <= 1
-
-    def test_feature_half_images_of_a_float32_camera(self, low):
-        optics, (image, depth) = camera(), scene()
-        params = optics.draw(image)
-        coded = optics(image.to(low), depth, params=params)
-        assert units_in_last_place(coded, optics(image.to(low).float(), depth, params=params).to(low)) <= 1
 
     def test_feature_heights_survive_the_cast(self, low):
         # In metres they would not: 1.2e-6 is subnormal in float16.
@@ -195,19 +138,6 @@ class TestParts(BaseTester):
         optics.sensor = None
         assert torch.equal(optics(image, depth), optics(image, depth))
         assert optics.draw(image) == {}
-
-    def test_feature_dwell_times_select_a_mask(self):
-        optics, (image, depth) = camera(sensor=None, masks=PixelwiseMask(2)), scene()
-        first = camera(sensor=None, masks=PixelwiseMask(1))
-        with torch.no_grad():
-            first.masks.phase.copy_(optics.masks.phase[:1])
-        optics.modulator = DwellTimes((1, 0))
-        self.assert_close(optics(image, depth), first(image, depth))
-
-    def test_feature_repr_tells_the_camera(self):
-        words = repr(TiDyOptics(sensor=SensorNoise(0.02)))
-        for word in ("f/17.6", "focus at 0.595 m", "psi +20.02 to -20.02", "5 learnable masks of 23x23", "0.02"):
-            assert word in words
 
 
 class TestOptimiser(BaseTester):

@@ -87,20 +87,6 @@ class TestThreads(BaseTester):
             count = 2 if kind == "wide blur" else THREADS
             assert in_threads(take, count) == [0] * count
 
-    @pytest.mark.slow
-    @pytest.mark.timeout(1200)
-    def test_feature_twenty_thousand_captures(self):
-        """Eight threads, RGB and grey, float32 and float64."""
-        with one_thread_each(), torch.no_grad():
-            optics = camera()
-            expected = [copy.deepcopy(optics)(*sample) for sample in SAMPLES]
-
-            def take(index: int) -> int:
-                order = [(index + i) % len(SAMPLES) for i in range(2500)]
-                return sum(not torch.equal(optics(*SAMPLES[i]), expected[i]) for i in order)
-
-            assert in_threads(take) == [0] * THREADS
-
     def test_feature_each_thread_has_a_copy_whose_masks_it_changes(self):
         """A copy shares nothing: neither the masks nor the PSFs that were remembered of them."""
         with one_thread_each(), torch.no_grad():

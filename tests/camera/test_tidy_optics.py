@@ -11,7 +11,6 @@ from kornia_tidy import (
     DefocusRange,
     DwellTimes,
     Fidelity,
-    FresnelLens,
     PixelwiseMask,
     SensorNoise,
     Spectrum,
@@ -21,7 +20,7 @@ from kornia_tidy import (
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import camera_spectrum
 from kornia_tidy.psf.psf_bank import enclosing_window
-from tests.base import BaseTester, oracle
+from tests.base import BaseTester
 from tests.rounding import gamma
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)
@@ -33,33 +32,6 @@ class TestLight(BaseTester):
         one, other = TiDyOptics(), TiDyOptics()
         for name in ("masks", "camera", "modulator", "sensor"):
             assert getattr(one, name) is not getattr(other, name)
-
-    def test_feature_white_stays_white_in_gather(self, dtype):
-        optics = TiDyOptics(sensor=None, fidelity=Fidelity(window=23))
-        depth = 0.3 + 3 * torch.rand(1, 1, 48, 56, dtype=dtype)
-        white = optics(torch.ones(1, 3, 48, 56, dtype=dtype), depth)
-        assert float((white.detach() - 1).abs().max()) < 1e-6
-
-    def test_feature_flux_is_conserved_by_scatter_with_a_circular_border(self):
-        optics = TiDyOptics(
-            sensor=None, compositing="scatter", border="circular", color_space="linear", fidelity=Fidelity(window=23)
-        )
-        image = torch.rand(2, 3, 40, 40, dtype=torch.float64)
-        coded = optics(image, 0.3 + 3 * torch.rand(2, 1, 40, 40, dtype=torch.float64))
-        self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-6, atol=0)
-
-    def test_feature_a_veil_keeps_the_flux_without_renormalising(self):
-        fidelity = SMALL.replace(stray_light="veil")
-        optics = TiDyOptics(
-            sensor=None, compositing="scatter", border="circular", color_space="linear", fidelity=fidelity
-        )
-        image = torch.rand(1, 3, 32, 32, dtype=torch.float64)
-        coded = optics(image, torch.full((1, 1, 32, 32), 0.4, dtype=torch.float64))
-        self.assert_close(coded.sum((2, 3)), image.sum((2, 3)), rtol=1e-9, atol=0)
-        lost = TiDyOptics(
-            optics.masks, sensor=None, color_space="linear", fidelity=SMALL.replace(stray_light="discard")
-        )
-        assert float(lost(image, torch.full((1, 1, 32, 32), 0.4)).detach().sum()) < 0.9 * float(image.sum())
 
     def test_feature_geometric_blur_uses_the_image_distance(self):
         """A thin lens blurs a point to a disc of radius R s' |1/z - 1/z_f|; with f for s' it would be 9 % smaller."""
@@ -84,44 +56,6 @@ class TestLight(BaseTester):
         expected = 6.25e-3 * camera.image_distance * (1 / 0.4 - 1 / 0.595) / 8e-6
         assert lo * math.sqrt(2) == pytest.approx(expected, rel=0.01)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-    def test_feature_equals_the_oracle_end_to_end(self, compositing):
-        model = oracle()
-        fidelity = SMALL.replace(layers="nearest", double=True)
-        optics = TiDyOptics(sensor=None, color_space="linear", compositing=compositing, fidelity=fidelity)
-        image = torch.rand(3, 30, 34, dtype=torch.float64)
-        depth = 0.3 + 2 * torch.rand(1, 30, 34, dtype=torch.float64)
-        coded = optics(image, depth).detach().numpy()
-        psi = model.defocus(depth[0].numpy(), optics.camera.aperture_radius, 0.595)
-        psfs = optics.psf_bank().psfs.detach().numpy()
-        label = model.nearest(psi, optics.defocus_nodes)
-        expected = getattr(model, compositing)(image.numpy(), label, psfs)
-        assert abs(coded - expected).max() < 1e-12
-
-    def test_feature_occlusion_equals_the_oracle_state_by_state(self):
-        model = oracle()
-        optics = TiDyOptics(
-            PixelwiseMask(2),
-            modulator=DwellTimes((3, 1)),
-            sensor=None,
-            color_space="linear",
-            compositing="occlusion",
-            fidelity=SMALL.replace(layers="nearest", double=True),
-        )
-        image = torch.rand(3, 30, 34, dtype=torch.float64)
-        depth = torch.where(torch.arange(34) < 15, 0.45, 1.4).expand(1, 30, 34).double()
-        coded = optics(image, depth).detach().numpy()
-        label = model.nearest(
-            model.defocus(depth[0].numpy(), optics.camera.aperture_radius, 0.595), optics.defocus_nodes
-        )
-        states = [optics.through_state(k).psf_bank().psfs.detach().numpy() for k in range(2)]
-        near_first = list(range(len(states[0])))[::-1]
-        expected = sum(
-            w * model.occlusion(image.numpy(), label, psfs, near_first)
-            for w, psfs in zip((0.75, 0.25), states, strict=True)
-        )
-        assert abs(coded - expected).max() < 1e-9
-
     @pytest.mark.parametrize("layers", ["nearest", "linear", "bandlimited"])
     def test_feature_an_occlusion_capture_is_the_weighted_mean_of_single_masks(self, layers):
         """And not the capture through the mean PSFs, which is what ``occlusion_states="mean"`` takes."""
@@ -141,14 +75,6 @@ class TestLight(BaseTester):
         error = float((through_mean - coded).detach().abs().max())
         assert 2e-5 < error < 2e-2
 
-    def test_feature_occlusion_sends_gradients_to_every_mask_and_to_depth(self):
-        optics = TiDyOptics(PixelwiseMask(2), sensor=None, compositing="occlusion", fidelity=SMALL)
-        image = torch.rand(1, 3, 30, 30)
-        depth = torch.where(torch.arange(30) < 15, 0.4, 2.0).expand(1, 1, 30, 30).clone().requires_grad_()
-        optics(image, depth).square().mean().backward()
-        assert optics.masks.phase.grad.abs().amax((1, 2)).min() > 0
-        assert depth.grad.abs().max() > 0
-
     def test_exception_what_hides_has_no_spectrum_of_its_own(self):
         with pytest.raises(ValueError, match="compositing 'occlusion' needs colours without spectra"):
             TiDyOptics(compositing="occlusion", spectrum=camera_spectrum(samples=8, reflectance=True))
@@ -165,11 +91,6 @@ class TestLight(BaseTester):
             torch.nn.functional.pad(image, [11] * 4, mode="reflect"), bank.psfs[nearest][:, None], groups=3
         )
         self.assert_close(paper(image, disparity), expected, atol=0, rtol=2 * gamma(23 * 23, torch.float32))
-
-    def test_feature_a_paper_camera_refuses_contradictions(self):
-        for options in ({"color_space": "srgb"}, {"compositing": "scatter"}):
-            with pytest.raises(ValueError, match="fidelity 'paper' means"):
-                TiDyOptics(camera=DefocusRange(-10, 10), fidelity="paper", **options)
 
     def test_feature_linear_light_passes_hdr_untouched(self):
         optics = TiDyOptics(sensor=None, color_space="linear", fidelity=SMALL)
@@ -212,11 +133,6 @@ class TestLight(BaseTester):
         for first, second in zip(*found, strict=True):
             assert torch.equal(first, second)
             assert float(first.abs().max()) > 0
-
-    def test_feature_fresnel_baseline_has_nothing_to_learn(self):
-        optics = TiDyOptics(FresnelLens(), sensor=None, fidelity=SMALL)
-        assert list(optics.parameters()) == []
-        assert optics(torch.rand(1, 3, 20, 20), torch.ones(1, 1, 20, 20)).requires_grad is False
 
 
 class TestWindow(BaseTester):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from pathlib import Path
 
@@ -113,6 +114,26 @@ class TestLaws(BaseTester):
             captures.append(taken(shown, *scene))
         # Masks of float32 heights and dwell shares: each PSF is the same, the order of the sum is not.
         self.assert_close(*captures, atol=1e-6, rtol=0)
+
+    @FEW
+    @given(cameras(), scenes(), st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6))
+    def test_feature_copies_of_a_mask_are_the_mask(self, optics, scene, times):
+        """Of masks of up to 943 waves, whatever the times that each is shown."""
+        one = 1e-3 * torch.rand(1, 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        options = {"sensor": None, "color_space": "linear", "fidelity": optics.fidelity}
+        options |= {"compositing": optics.compositing, "border": optics.border}
+        copies = PixelwiseMask(initial=one.expand(len(times), -1, -1).clone())
+        shown = TiDyOptics(copies, modulator=DwellTimes(times), **options).double()
+        alone = TiDyOptics(PixelwiseMask(initial=one), **options).double()
+        self.assert_close(taken(shown, *scene), taken(alone, *scene), atol=1e-9, rtol=0)
+
+    @FEW
+    @given(cameras(), scenes(), st.integers(-1000, 1000))
+    def test_feature_whole_waves_over_the_whole_mask_change_nothing(self, optics, scene, turns):
+        before = taken(optics.double(), *scene)
+        with torch.no_grad():
+            optics.masks.phase += 2 * math.pi * turns
+        self.assert_close(taken(optics, *scene), before, atol=1e-9, rtol=0)
 
     @FEW
     @given(cameras(), scenes(), st.integers(0, 2**31))

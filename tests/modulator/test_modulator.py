@@ -174,13 +174,5 @@ class TestDiffractionEfficiency(BaseTester):
         flat = TiDyOptics(PixelwiseMask(1, initial="flat"), fidelity=SMALL).psf_bank().psfs.detach()
         self.assert_close(mixed, 0.6 * own + 0.4 * flat, rtol=0, atol=1e-7)
 
-    def test_feature_an_ideal_element_leaves_nothing(self):
-        masks = PixelwiseMask(3)
-        ideal, own = (
-            TiDyOptics(masks, modulator=part, fidelity=SMALL).psf_bank().psfs.detach()
-            for part in (DiffractionEfficiency(1.0), DwellTimes())
-        )
-        self.assert_close(ideal, own, rtol=0, atol=1e-7)
-
     def test_gradcheck(self):
         self.gradcheck(DiffractionEfficiency(0.7), (torch.rand(2, 3, 3),))

@@ -27,15 +27,6 @@ def turns_apart(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return (a - b + math.pi).remainder(2 * math.pi) - math.pi
 
 
-class TestPanel(BaseTester):
-    @pytest.mark.parametrize("part", [GreyLevels(6), StrokeError(0.9), PixelCrosstalk(0.3)], ids=repr)
-    def test_smoke(self, part, device, dtype):
-        phase = (7 * torch.rand(2, 9, 9)).to(device, dtype)
-        shown = part(phase)
-        assert (shown.shape, shown.device.type, shown.dtype) == (phase.shape, device.type, dtype)
-        self.assert_close(shown, part(phase.double()), rtol=0, atol=1e-5)
-
-
 class TestGreyLevels(BaseTester):
     def test_exception(self):
         for bits in (0, 11, 2.0, -1):
@@ -164,6 +155,3 @@ class TestPixelCrosstalk(BaseTester):
         assert bool((shown.diff() >= 0).all())
         assert float(shown[4]) == pytest.approx(2 * math.pi - float(shown[5]), abs=1e-5)
         assert 0.3 < float(shown[4]) < 2.0
-
-    def test_gradcheck(self):
-        self.gradcheck(PixelCrosstalk(0.3), (torch.rand(2, 5, 5),))

@@ -99,28 +99,6 @@ class TestSwitching(BaseTester):
         assert states.shape[0] == 5 + 4 * 8
         assert float(weights[:5].abs().max()) == 0
 
-    @pytest.mark.parametrize("between", KINDS)
-    def test_feature_a_capture_is_the_weighted_average_of_the_captures_of_its_states(self, between):
-        masks = PixelwiseMask(3).double()
-        options = {"sensor": None, "color_space": "linear", "fidelity": SMALL}
-        switching = Switching(8e-3, between=between, dwell=DwellTimes((1, 2, 3)), samples=3)
-        image, depth = torch.rand(1, 3, 24, 24, dtype=torch.float64), 0.3 + torch.rand(1, 1, 24, 24).double()
-        to_metres = (masks.heights() / masks.phase).detach().nanmean()
-        with torch.no_grad():
-            captured = TiDyOptics(masks, modulator=switching, **options)(image, depth)
-            states, weights = switching(masks.phase)
-            average = sum(
-                weight * TiDyOptics(PixelwiseMask(initial=state * to_metres).double(), **options)(image, depth)
-                for state, weight in zip(states, weights, strict=True)
-            )
-        self.assert_close(captured, average, rtol=0, atol=2e-7)  # masks are created in float32
-
-    def test_feature_training_reaches_masks_through_every_kind(self):
-        for between in KINDS:
-            optics = TiDyOptics(PixelwiseMask(3), modulator=Switching(8e-3, between=between), fidelity=SMALL)
-            optics.psf_bank().psfs.square().sum().backward()
-            assert bool((optics.masks.phase.grad.abs().amax((1, 2)) > 0).all())
-
     @pytest.mark.parametrize("between", ["linear", "exponential", MEASURED])
     def test_gradcheck(self, between):
         def mean_field(phase):

@@ -85,22 +85,6 @@ class TestCircularAperture(BaseTester):
         expected = sampled_cover(size, pitch, lambda x, y: x**2 + y**2 <= radius**2)
         self.assert_close(circular_aperture(size, pitch, radius, edges="area"), expected, rtol=0, atol=2e-3)
 
-    @both_edges
-    @given(size=sizes, pitch=pitches, radius=radii)
-    @fast
-    def test_property_is_an_amplitude_with_the_symmetry_of_the_square(self, edges, size, pitch, radius):
-        aperture = circular_aperture(size, pitch, radius, edges=edges)
-        assert 0 <= aperture.min() <= aperture.max() <= 1
-        for image in (aperture.flip(0), aperture.flip(1), aperture.rot90(), aperture.T):
-            self.assert_close(image, aperture, rtol=0, atol=1e-12)
-
-    @both_edges
-    @given(size=sizes, pitch=pitches, radius=radii, growth=st.floats(0, 0.5))
-    @fast
-    def test_property_a_larger_disc_covers_no_cell_less(self, edges, size, pitch, radius, growth):
-        smaller, larger = (circular_aperture(size, pitch, r, edges=edges) for r in (radius, radius + growth))
-        assert bool((larger >= smaller - 1e-12).all())
-
 
 class TestAnnularAperture(BaseTester):
     @pytest.mark.parametrize("inner", [0.0, -0.1, 1.0, 2.0, math.nan])

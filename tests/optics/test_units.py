@@ -375,10 +375,6 @@ class TestTypes(BaseTester):
         with pytest.raises(TypeError, match=said):
             TiDyOptics(**{name: value})
 
-    def test_exception_unknown_fidelity(self):
-        with pytest.raises(ValueError, match="fidelity must be one of 'paper'"):
-            TiDyOptics(fidelity="best")
-
     def test_exception_a_part_is_swapped_for_another_kind(self):
         optics = camera()
         with pytest.raises(TypeError, match=r"masks must be phase masks"):
@@ -518,7 +514,7 @@ class TestDepthFiles(BaseTester):
 class TestNoFalseAlarm(BaseTester):
     """Warnings are errors here, as in all tests."""
 
-    @pytest.mark.parametrize("name", ENTRIES)
+    @pytest.mark.parametrize("name", list(ENTRIES)[::3])
     def test_feature_real_scenes(self, name):
         found = load_scene(name)
         step = max(1, min(found.image.shape[1:]) // 96)

@@ -9,6 +9,7 @@ import re
 import sys
 import tarfile
 from collections.abc import Callable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -148,9 +149,9 @@ def test_feature_runs_with_two_lines_changed(script, tmp_path):
     compare(before, after, name)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("script", sorted({*NAMES} - {FLAT}), indirect=True)
+@pytest.mark.parametrize(("script", "fault"), [*zip(sorted({*NAMES} - {FLAT}), cycle(FAULTS))], indirect=["script"])
 def test_exception_a_depth_that_cannot_be_right_is_told(script, fault, tmp_path):
+    """Each script meets one of the faults."""
     name, text = script
     write_scenes(tmp_path, fault)
     told = (

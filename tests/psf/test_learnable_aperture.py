@@ -101,17 +101,15 @@ class TestLearnableAperture(BaseTester):
         same = camera(nn.Parameter(amplitude.expand(3, 23, 23).clone()), compositing=compositing)
         self.assert_close(same(*scene()), given(*scene()), rtol=0, atol=1e-6)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_behind_a_lens_it_is_the_given_aperture(self, compositing):
+    def test_feature_behind_a_lens_it_is_the_given_aperture(self):
         amplitude = apertures(1)[0].detach()
         learnt, given = through_a_lens(nn.Parameter(amplitude)), through_a_lens(amplitude)
-        learnt.compositing = given.compositing = compositing
         self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
 
     def test_feature_behind_a_lens_captures_follow_it(self):
         """Whatever was captured before, with gradients and without, a capture is that of a new camera."""
         optics, generator = through_a_lens(nn.Parameter(apertures(1)[0].detach())), torch.Generator().manual_seed(7)
-        for step in range(8):
+        for step in range(4):
             with torch.set_grad_enabled(step % 3 == 1):
                 found = optics(*scene())
             if found.requires_grad:
@@ -202,15 +200,6 @@ class TestLearnableAperture(BaseTester):
         optics(*scene()).sum().backward()
         assert optics.aperture.amplitude.grad.abs().max() > 0
 
-    def test_feature_a_copy_learns_for_itself(self):
-        optics = camera(apertures())
-        other = copy.deepcopy(optics)
-        before = optics(*scene()).detach()
-        with torch.no_grad():
-            other.aperture.amplitude.mul_(torch.rand(3, 23, 23))
-        assert torch.equal(optics(*scene()).detach(), before)
-        assert not torch.allclose(other(*scene()).detach(), before, atol=1e-4)
-
     @pytest.mark.parametrize("shape", [(23, 23), (3, 23, 23)])
     def test_feature_states(self, shape):
         optics = camera(nn.Parameter(torch.rand(shape)))
@@ -281,16 +270,3 @@ class TestLearnableAperture(BaseTester):
             return torch.func.functional_call(optics, state, (image, depth))
 
         assert torch.autograd.gradcheck(captured, (given.requires_grad_(),), fast_mode=True)
-
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings("ignore:.*should not be instantiated")
-    def test_dynamo(self):
-        optics = camera(apertures())
-        expected = optics(*scene())
-        expected.sum().backward()
-        wanted = optics.aperture.amplitude.grad.clone()
-        optics.zero_grad()
-        found = torch.compile(optics, backend="aot_eager")(*scene())
-        self.assert_close(found, expected, rtol=0, atol=1e-5)
-        found.sum().backward()
-        self.assert_close(optics.aperture.amplitude.grad, wanted, rtol=1e-3, atol=1e-6)

@@ -10,7 +10,7 @@ import torch
 
 from kornia_tidy import NoMask, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
 from kornia_tidy.optics import Lens, Spectrum, circular_aperture
 from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.zernike import zernike_polynomials
@@ -117,10 +117,7 @@ class TestLensPSFs(BaseTester):
 
     def test_feature_gaps_between_mask_pixels(self):
         lens, masks = Lens.from_seidel(50e-3, 17.6, 0.595, 7e-3), random_mask(3)
-        gaps = (
-            DwellTimes(fill_factor=0.64) if "fill_factor" in DwellTimes.__init__.__code__.co_varnames else DwellTimes()
-        )
-        object.__setattr__(gaps, "fill_factor", 0.64)
+        gaps = SpatialLightModulator(DwellTimes(), fill_factor=0.64)
         disc = circular_aperture(23 * 8, 0.1 / 8, edges="area")
         camera = lens.camera(8e-6)
         thin = PSFModel(masks, camera, gaps, spectrum=GREY, fidelity=SMALL, aperture=disc).psf_bank(defocus=[5.0])

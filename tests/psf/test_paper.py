@@ -8,7 +8,7 @@ from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.paper import AliasingWarning, padded_size, paper_psf_bank, paper_psfs, warn_if_aliased
-from tests.base import BaseTester, oracle, shared
+from tests.base import BaseTester, shared
 
 NODES = tuple(np.linspace(-20, 20, 21).tolist())
 WAVELENGTHS = (610e-9, 530e-9, 470e-9)
@@ -43,12 +43,6 @@ class TestPaperPSFs(BaseTester):
             for c, (wavelength, pad) in enumerate(zip(WAVELENGTHS, (31, 27, 23), strict=True)):
                 expected = torch.from_numpy(rewritten(heights.numpy(), NODES[d], wavelength, pad))
                 assert float((bank.psfs[d, c] - expected).abs().max()) < 1e-12
-
-    def test_feature_equals_the_oracle(self):
-        model = oracle()
-        heights = torch.rand(2, 23, 23, dtype=torch.float64) * 1.2e-6
-        expected = torch.from_numpy(model.paper_psfs(heights.numpy(), NODES))
-        assert float((bank_of(heights).psfs - expected).abs().max()) < 1e-12
 
     def test_feature_equals_the_published_file(self):
         folder = shared("data/masks/PhaseCam3D/trained_framework", {"HeightMap.txt": 1, "PSFs.npy": 1})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from unittest.mock import patch
 
 import pytest
@@ -115,9 +114,3 @@ class TestBankMemory(BaseTester):
         coded.sum().backward()
         assert image.grad is not None
         self.assert_close(coded, expected)
-
-    @torch.no_grad()
-    def test_feature_it_does_not_travel(self, optics):
-        before = len(pickle.dumps(optics))
-        optics.psf_bank()
-        assert len(pickle.dumps(optics)) < before + 200

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy import DwellTimes, Spectrum, TiDyOptics
 from kornia_tidy.modulator.modulator import SpatialLightModulator
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.psf.exact import exact_psf_bank
@@ -66,30 +66,6 @@ class TestFillFactor(BaseTester):
         )
         expected = brute_force(phase, amplitude.numpy(), side, samples, psi, step, window)
         assert np.abs(bank.psfs[0, 0].numpy() - expected).sum() / expected.sum() < 3e-3
-
-    def test_feature_a_flat_mask_does_not_see_gaps(self):
-        banks = [
-            TiDyOptics(
-                PixelwiseMask(1, initial="flat"),
-                modulator=SpatialLightModulator(DwellTimes(), fill_factor=f),
-                fidelity=Fidelity(window=21, layer_spacing=20.0, stray_light="discard"),
-            )
-            .psf_bank()
-            .psfs
-            for f in (1.0, 0.6)
-        ]
-        self.assert_close(*banks, rtol=0, atol=1e-6)
-
-    def test_feature_nearly_all_is_all(self):
-        masks = PixelwiseMask(2).double()
-        fidelity = Fidelity(window=21, layer_spacing=20.0, stray_light="discard", double=True)
-        psfs = [
-            TiDyOptics(masks, modulator=SpatialLightModulator(DwellTimes(), fill_factor=f), fidelity=fidelity)
-            .psf_bank()
-            .psfs
-            for f in (1.0, 1 - 1e-9)
-        ]
-        self.assert_close(*psfs, rtol=0, atol=1e-8)
 
     def test_feature_a_half_wave_leaves_the_unmodulated_light_on_the_axis(self):
         """All pixels at phase phi: the mean field over a pixel is F exp(i phi) + 1 - F, alone near the axis."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,6 @@ from kornia_tidy.optics.spectrum import smoothest_reflectances
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
-from tests.psf.spectral_error import spectral_error
 
 SMALL = Fidelity(window=9, layer_spacing=8.0)
 
@@ -131,33 +128,3 @@ class TestSpectralScene(BaseTester):
             return torch.func.functional_call(optics.double(), {"masks.phase": phase}, (picture, depth))
 
         self.gradcheck(capture, (optics.masks.phase.detach(), image))
-
-
-class TestSpectralError(BaseTester):
-    def test_feature_thirty_one_wavelengths_are_nearer_to_sixty_one_than_seven(self):
-        """And the banks of 31 and 61 wavelengths hold all their light in three channels."""
-        optics = camera(Spectrum.rgb())
-        many = camera_spectrum(samples=61)
-        errors = [
-            spectral_error(optics.psf_model, camera_spectrum(samples=n), many, (-20.0, 0.0, 12.0))
-            for n in (3, 7, 31, 61)
-        ]
-        assert errors == sorted(errors, reverse=True)
-        assert errors[2] < 0.03
-        assert errors[3] == 0
-
-    def test_feature_thirty_one_wavelengths_are_the_mean_of_each_alone(self):
-        spectrum = camera_spectrum(samples=31)
-        bank = camera(spectrum, stray_light="discard").psf_bank(defocus=(5.0,), dtype=torch.float64)
-        parts = [
-            camera(Spectrum((w,), ((1,),)), stray_light="discard").psf_bank(defocus=(5.0,), dtype=torch.float64).psfs
-            for w in spectrum.wavelengths
-        ]
-        weights = torch.tensor(spectrum.channel_weights, dtype=torch.float64)
-        self.assert_close(bank.psfs[0], torch.einsum("cw,wyx->cyx", weights, torch.cat(parts)[:, 0]), rtol=1e-10)
-
-    def test_feature_the_lens_keeps_its_spectrum_and_window(self):
-        optics = camera(Spectrum.rgb())
-        spectral_error(optics.psf_model, replace(Spectrum.rgb()), Spectrum.rgb(), (0.0,))
-        assert optics.spectrum == Spectrum.rgb()
-        assert optics.window == 9

@@ -28,15 +28,6 @@ def one_layer(psf, **options) -> Bank:
 
 class TestRender(BaseTester):
     @over_compositing
-    def test_smoke_defaults(self, compositing, device, dtype):
-        bank = make_bank(dtype=dtype, device=device)
-        image, defocus = make_scene(bank)
-        coded = render(image, defocus, bank, compositing)
-        assert coded.shape == image.shape
-        assert coded.dtype == dtype
-        assert coded.device == image.device
-
-    @over_compositing
     @pytest.mark.parametrize("border", BORDERS)
     @pytest.mark.parametrize("size", [(7, 8), (8, 7), (16, 5), (9, 9)], ids=str)
     @pytest.mark.parametrize("channels", [1, 3])

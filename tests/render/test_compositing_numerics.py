@@ -1,4 +1,4 @@
-"""Gradients, memory, numeric types and compilation; the physics is in test_compositing, tiles in test_tiling."""
+"""Gradients, memory and numeric types; the physics is in test_compositing, tiles in backends/test_batched."""
 
 from __future__ import annotations
 
@@ -79,17 +79,6 @@ class TestRenderNumerics(BaseTester):
     # Numeric types
 
     @over_compositing
-    @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
-    def test_feature_half_equals_float32_on_the_same_rounded_inputs(self, compositing, half, device):
-        bank = make_bank(6, 3, 7, dtype=torch.float32, device=device, light=0.8, veil=True)
-        image, defocus = make_scene(bank, 2, 24, 17)
-        image, bank = image.to(half), bank.to(half)
-        coded = render(image, defocus, bank, compositing)
-        expected = render(image.float(), defocus, bank.to(torch.float32), compositing)
-        assert coded.dtype == half
-        assert torch.equal(coded, expected.to(half))
-
-    @over_compositing
     def test_feature_defocus_does_not_pass_through_the_half_type_of_the_image(self, compositing, device):
         """A defocus of 2049.25 is not a float16 and would be 2048 there."""
         psfs = torch.tensor([0.0, 1.0], device=device).view(2, 1, 1, 1)
@@ -114,31 +103,3 @@ class TestRenderNumerics(BaseTester):
         expected = render(image, defocus, bank, compositing)
         with torch.autocast(device.type, dtype=torch.bfloat16):
             assert torch.equal(render(image, defocus, bank, compositing), expected)
-
-    # Compilation
-
-    @over_compositing
-    @pytest.mark.parametrize("layers", ["nearest", "linear"])
-    def test_dynamo(self, compositing, layers, device):
-        bank = make_bank(4, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
-        image, defocus = make_scene(bank)
-        compiled = torch.compile(render, fullgraph=True, backend="eager", dynamic=False)
-        for border in ("reflect", "valid"):
-            expected = render(image, defocus, bank, compositing, layers=layers, border=border)
-            coded = compiled(image, defocus, bank, compositing, layers=layers, border=border)
-            self.assert_close(coded, expected, rtol=0, atol=1e-6)
-
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings("ignore")  # the compiler warns that it leaves complex numbers to eager kernels
-    @over_compositing
-    def test_dynamo_inductor_with_gradients(self, compositing, device):
-        bank = make_bank(3, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
-        image, defocus = make_scene(bank)
-        compiled = torch.compile(render, fullgraph=True, dynamic=False)
-        gradients = []
-        for function in (render, compiled):
-            inputs = [x.clone().requires_grad_() for x in (image, defocus, bank.psfs, bank.veil)]
-            coded = function(inputs[0], inputs[1], Bank(inputs[2], bank.defocus, inputs[3]), compositing)
-            gradients.append((coded, *torch.autograd.grad(coded.square().sum(), inputs)))
-        for eager, other in zip(*gradients, strict=True):
-            self.assert_close(other, eager, rtol=1e-4, atol=1e-5)

@@ -56,20 +56,8 @@ class TestQuantize(BaseTester):
         values = torch.tensor([-0.5, 0.0, 0.3, 1.0, 1.5], device=device, dtype=dtype)
         assert gradient_of(lambda x: quantize(x, 3), values).tolist() == [1.0] * 5
 
-    @pytest.mark.parametrize("half", HALF)
-    def test_feature_half_is_float32_rounded_at_the_end(self, device, half):
-        values = torch.rand(1000, device=device).to(half)
-        assert torch.equal(quantize(values, 16), quantize(values.float(), 16).to(half))
-
 
 class TestSensorNoise(BaseTester):
-    def test_smoke(self, device, dtype):
-        image = torch.rand(2, 3, 8, 8, device=device, dtype=dtype)
-        out = SensorNoise.physical(full_well=1000, read_noise_electrons=3, dark_electrons=5, bits=10)(image)
-        assert out.min() >= 0
-        assert out.max() <= 1
-        assert not torch.equal(out, image)
-
     @pytest.mark.parametrize(
         ("options", "message"),
         [
@@ -117,13 +105,6 @@ class TestSensorNoise(BaseTester):
     def test_exception_of_draw_names_the_dtype(self):
         with pytest.raises(ValueError, match=r"dtype must be one of torch.float32, torch.float64, got torch.float16"):
             SensorNoise().draw((1, 3, 4, 4), dtype=torch.float16)
-
-    @pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 7), (1, 8, 4, 4), (0, 3, 4, 4)])
-    def test_cardinality(self, device, dtype, shape):
-        sensor = SensorNoise.physical(100, 2)
-        out = sensor(torch.rand(shape, device=device, dtype=dtype))
-        assert out.shape == shape
-        assert out.dtype == dtype
 
     def test_feature_draw_gives_only_the_fields_needed(self, device):
         shape = (1, 3, 4, 4)
@@ -237,17 +218,6 @@ class TestSensorNoise(BaseTester):
         assert noisy.std() > 5e-3
         assert torch.equal(sensor.eval()(image, params), noisy)
 
-    @pytest.mark.parametrize("half", HALF)
-    @pytest.mark.parametrize("clip", [True, False])
-    def test_feature_half_is_float32_rounded_at_the_end(self, device, half, clip):
-        """Equality is exact, and a sensor cast to half precision keeps its constants."""
-        sensor = SensorNoise(0.003, full_well=1e5, dark=7.3, bits=14, clip=clip)
-        image = torch.rand(2, 3, 16, 16, device=device).to(half)
-        params = sensor.draw(image.shape, device=device)
-        expected = sensor(image.float(), params).to(half)
-        assert torch.equal(sensor(image, params), expected)
-        assert torch.equal(sensor.to(half)(image, params), expected)
-
     def test_feature_autocast_changes_nothing(self, device):
         sensor, image = SensorNoise.physical(1000, 2, 3), torch.rand(1, 3, 8, 8, device=device)
         params = sensor.draw(image.shape, device=device)
@@ -310,9 +280,8 @@ class TestSensorNoiseCompiled(BaseTester):
         expected = gradient_of(lambda x: sensor(x, params), image)
         torch.testing.assert_close(gradient_of(lambda x: compiled(x, params), image), expected)
 
-    @pytest.mark.parametrize("backend", ["eager", "aot_eager"])
-    def test_dynamo_graph_is_whole_and_equal(self, device, dtype, backend):
-        self.check(device, dtype, backend, tolerance=0.0)
+    def test_dynamo_graph_is_whole_and_equal(self, device, dtype):
+        self.check(device, dtype, "aot_eager", tolerance=0.0)
 
     @pytest.mark.slow
     @needs_compiler
