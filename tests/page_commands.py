@@ -28,7 +28,7 @@ from kornia_tidy.cli.command_line import read_command
 
 ROOT = Path(__file__).resolve().parents[1]
 STOPS = {"|", "||", "&&", ";", ">"}  # what ends a command in a recipe of make
-BUILTIN = {"mkdir", "tee"}
+BUILTIN = {"mkdir", "source", "tee"}
 FEW_TESTS = "-n0 tests/test_seeds.py"
 NO_INDEX = re.compile(r"No matching distribution found|Could not find a version|Connection|timed out|resolution")
 LONGEST = 240  # seconds of one command that is run
@@ -186,6 +186,8 @@ def make_checkout(folder: Path) -> None:
 def run_in_checkout(words: list[str], folder: Path, place: str) -> str:
     """Run a command in a folder of `make_checkout`, with few tests and without installing; return what it prints."""
     python = [str(folder / ".venv" / "bin" / "python")]
+    if words[0] == "source":
+        return ""  # the environment is that of the folder
     if words[:2] == ["make", "test"]:
         words = [*words, f"ARGS={FEW_TESTS}"]
     elif words[0] == "pip":

@@ -86,6 +86,18 @@ def shorten_factories(
     return signature and signature.replace("<factory>", "..."), returned
 
 
+def drop_dead_links_of_sources(_app: object, env: Any) -> None:
+    """Drop pages of modules without source, and links of sources to descriptions that stand under another name."""
+    described = {name for name, *_ in env.get_domain("py").get_objects()}
+    for module, entry in list(getattr(env, "_viewcode_modules", {}).items()):
+        if not entry:
+            del env._viewcode_modules[module]
+            continue
+        _, _, used, package = entry
+        for name in [name for name in used if f"{package}.{name}" not in described]:
+            del used[name]
+
+
 def setup(app: Any) -> None:
     """Register the functions of this file with Sphinx."""
     import drawn_in_page  # noqa: PLC0415
@@ -94,5 +106,6 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", keep_sentences_of_properties, priority=400)
     app.connect("autodoc-process-signature", shorten_factories)
     app.connect("missing-reference", references.resolve)
+    app.connect("env-check-consistency", drop_dead_links_of_sources)
     app.add_directive("mermaid", drawn_in_page.FlowChart)
     app.add_html_math_renderer("mathml", (drawn_in_page.visit_inline, None), (drawn_in_page.visit_block, None))

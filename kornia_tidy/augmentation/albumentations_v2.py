@@ -1,7 +1,7 @@
 """albumentations 2: the camera as a transform of arrays that takes depth as a target.
 
-Needs albumentations 2; nothing else of the package imports it. Its wheel requires a second OpenCV, which overwrites the
-one of this package: ``pip install --no-deps albumentations albucore`` keeps it.
+Needs albumentations 2; nothing else of the package imports it. Its wheel brings a second OpenCV, which overwrites that
+of this package: ``pip install --force-reinstall --no-deps opencv-contrib-python-headless`` puts it back.
 """
 
 from __future__ import annotations
