@@ -163,6 +163,12 @@ class TestDecodeExr(BaseTester):
         with pytest.raises(ValueError, match=r"holds \(37, 53\) pixels of a display window of \(10000, 10000\)"):
             decode_exr(data)
 
+    def test_exception_jpeg_2000(self, library):
+        if not hasattr(library, "HTJ2K32_COMPRESSION"):
+            pytest.skip("this OpenEXR has no compression by JPEG 2000")
+        with pytest.raises(ValueError, match="compressed by JPEG 2000"):
+            decode_exr(exr(library, {"Z": DEPTH}, compression=library.HTJ2K32_COMPRESSION))
+
     def test_exception_tiles_that_the_file_cannot_hold(self, library):
         data = exr(library, {"Z": DEPTH}, type=library.tiledimage, tiles=library.TileDescription())
         place = data.index(b"tiledesc\0") + len(b"tiledesc\0") + 4

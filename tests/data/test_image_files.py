@@ -136,3 +136,8 @@ class TestWriteImage(BaseTester):
             write_image(tmp_path / "a.png", torch.zeros(1, 2, 2).byte())
         with pytest.raises(FileNotFoundError, match=r"there is no folder .*none"):
             write_image(tmp_path / "none" / "a.png", torch.zeros(1, 2, 2))
+
+    def test_exception_path_is_a_folder(self, tmp_path):
+        (tmp_path / "a.png").mkdir()
+        with pytest.raises(ValueError, match="it is a folder"):
+            write_image(tmp_path / "a.png", torch.zeros(1, 2, 2))

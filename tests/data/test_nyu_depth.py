@@ -111,6 +111,11 @@ class TestNYUDepthV2(BaseTester):
         with pytest.raises(ValueError, match=r"names frame 6, and .* has frames 1 to 5"):
             NYUDepthV2(published[0], tmp_path / "mine.txt")
 
+    def test_exception_damaged_split(self, copy):
+        (copy / "splits.mat").write_bytes(b"no matlab")
+        with pytest.raises(ValueError, match=r"cannot read .*splits\.mat: it should hold trainNdxs"):
+            NYUDepthV2(copy, "train")
+
     @pytest.mark.parametrize("kept", [100, 300_000])
     def test_exception_cut_short(self, copy, kept):
         path = copy / "nyu_depth_v2_labeled.mat"

@@ -6,7 +6,7 @@ import hypothesis.strategies as st
 import pytest
 import torch
 from hypothesis import given, settings
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import DeadLeaves, Patches, UnreadableItemError, central_crop, crop, random_crop
@@ -115,6 +115,12 @@ class TestPatches(BaseTester):
         assert torch.equal(one[7]["depth"], same[7]["depth"])
         assert torch.equal(torch.get_rng_state(), before)
         assert sum(torch.equal(one[index]["depth"], other[index]["depth"]) for index in range(50)) < 3
+
+    def test_feature_subsets_and_negative_indices(self):
+        patches = Patches(Subset(Numbered(10), [3, 8]), 5)
+        assert {scene_of(patches[0]), scene_of(patches[1])} == {3, 8}
+        assert torch.equal(patches[-1]["depth"], patches[1]["depth"])
+        assert len(list(patches)) == 2
 
     def test_feature_the_transform_sees_the_patch(self):
         transform = TiDyOptics(fidelity=FAST).as_transform(seed=1)

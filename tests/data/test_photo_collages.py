@@ -81,6 +81,12 @@ class TestPhotoCollage(BaseTester):
             seen |= set(away.argmin(1).tolist())
         assert seen >= set((parts > 0).sum(1).le(2).nonzero()[:, 0].tolist())  # three meet in few pixels
 
+    def test_feature_shapes_differ_in_exposure_and_tint(self, folder, varied):
+        image, _ = photo_collage([folder / "more" / "grey.jpg"], 200, 200, seed=3)
+        light = rgb_to_linear_rgb(image[None])[0].flatten(1)
+        assert light.mean(0).std() > 0.01
+        assert (light[0] / light[2]).std() > 0.01
+
     @pytest.mark.parametrize(("reduction", "draws"), [((1.0, 1.0), (0, 0, 0, 1)), ((1.0, 1.0), (0.3, 1, 0.5, 1))])
     def test_feature_a_part_that_is_not_reduced_is_that_of_the_file(self, reduction, draws, tmp_path, monkeypatch):
         """At two samples a pixel and a reduction of one, a sample is half a pixel of the file: enlarged twice."""

@@ -40,6 +40,12 @@ class TestReadRgbd(BaseTester):
         self.assert_close(large.image, image, rtol=0, atol=1e-4)
         assert large.valid.shape == large.depth.shape
 
+    def test_feature_grey_images_and_larger_depth(self, tmp_path):
+        write_image(tmp_path / "image.png", torch.full((1, 4, 6), 0.5))
+        write_depth(tmp_path / "depth.pfm", torch.ones(1, 8, 12))
+        scene = read_rgbd(tmp_path / "image.png", tmp_path / "depth.pfm", resample="image")
+        self.assert_close(scene.image, torch.full((1, 8, 12), 0.5), rtol=0, atol=0.003)
+
     def test_feature_guided_fill_leaves_the_mask(self, tmp_path):
         image = torch.zeros(3, 20, 30)
         image[..., 15:] = 1

@@ -41,6 +41,12 @@ class TestRGBDFolder(BaseTester):
             self.assert_close(sample["image"][:, 0, 0], torch.tensor([0.2, 0.2, 1.0]))
             assert torch.equal(sample["depth"], torch.full((1, 4, 6), index + 1.0))
 
+    def test_feature_names_are_sorted_as_text(self, tmp_path):
+        for number in (2, 10, 1):
+            write(tmp_path, f"s{number}.png", f"s{number}_depth.png", 1000)
+        data = RGBDFolder(tmp_path, "*.png", "*_depth.png", scale=0.001)
+        assert [data.name(index) for index in range(len(data))] == ["s1", "s10", "s2"]
+
     def test_feature_several_stars_must_all_agree(self, tmp_path):
         for scene, frame, millimetres in (("b", "0", 1), ("a", "1", 2), ("a", "0", 3)):
             write(tmp_path, f"{scene}/color/{frame}.png", f"{scene}/depth/{frame}.png", millimetres)
@@ -116,6 +122,12 @@ class TestRGBDFolder(BaseTester):
     def test_exception_patterns_without_equally_many_stars(self, tmp_path, image, depth):
         with pytest.raises(ValueError, match=r"must have a \* and equally many"):
             RGBDFolder(tmp_path, image, depth)
+
+    def test_exception_options_are_checked_before_any_file(self, tmp_path):
+        with pytest.raises(ValueError, match="focal_px and baseline_m are needed"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm", kind="disparity", invalid=[0])
+        with pytest.raises(TypeError, match="focal"):
+            RGBDFolder(tmp_path, "*.png", "*.pfm", focal=3.0)
 
     def test_exception_sizes_that_differ_are_an_unreadable_item(self, tmp_path):
         write(tmp_path, "x.png", "x_depth.png", 1)

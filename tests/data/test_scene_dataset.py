@@ -153,6 +153,9 @@ class TestSceneDataset(BaseTester):
             Stub(transform=refuse)[0]
         assert not isinstance(caught.value, UnreadableItemError)
 
+    def test_feature_grey_is_repeated(self):
+        assert torch.equal(Stub()[0]["image"], torch.full((3, 4, 5), 0.5))
+
     @pytest.mark.parametrize("index", [torch.tensor(0), -2, False])
     def test_feature_whatever_is_an_index_will_do(self, index):
         sample = Stub()[index]

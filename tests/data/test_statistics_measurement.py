@@ -52,6 +52,11 @@ class TestMeasuredStatistics(BaseTester):
         plain, sloped = (radial_spectrum(each).density for each in (texture, [each + ramp for each in texture]))
         self.assert_close(sloped[-12:], plain[-12:], rtol=0.01, atol=0)
 
+    def test_feature_grey_pictures_count_as_their_channel(self):
+        colour = pictures(PHOTOGRAPHS, count=1)[0]
+        grey = measured_statistics([colour[:1]])
+        assert grey == measured_statistics([colour])
+
     def test_feature_is_the_mean_over_pictures_of_any_size(self):
         one = pictures(PHOTOGRAPHS, count=1)[0]
         other = pictures(PHOTOGRAPHS, count=1, size=64, seed=1)[0]
@@ -97,6 +102,9 @@ class TestFit(BaseTester):
 
 
 class TestShade(BaseTester):
+    def test_feature_a_constant_picture_has_no_dark_pixels(self):
+        assert fitted_shade([torch.full((1, 64, 64), 0.3, dtype=torch.float64)])[0] == pytest.approx(1)
+
     def test_feature_light_around_is_that_of_the_model_where_the_picture_is_made_so(self):
         """Half of the columns dark, in stripes of 32 pixels: 4 pixels from a dark pixel an eighth is bright."""
         light = torch.tensor([0.02, 0.5], dtype=torch.float64).repeat_interleave(32).repeat(8).expand(1, 512, -1)

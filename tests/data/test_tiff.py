@@ -140,6 +140,10 @@ class TestReadsWhatIsStored(BaseTester):
         coded = lzw(RGB.tobytes(), old=True)
         assert np.array_equal(decoded(tiff(Page(RGB, photometric=2, compression=5, segments=[coded]))).values, RGB)
 
+    def test_feature_lengths_of_strips_that_are_not_given(self):
+        page = Page(RGB, photometric=2, compression=8, fields={279: None})
+        assert np.array_equal(decoded(tiff(page)).values, RGB)
+
     def test_feature_one_number_of_bits_for_all_samples(self):
         page = Page(RGB, photometric=2, fields={258: (3, [8]), 339: None})
         assert np.array_equal(decoded(tiff(page)).values, RGB)

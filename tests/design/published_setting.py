@@ -15,10 +15,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from kornia_tidy.design import design
 from kornia_tidy.design.fisher_information import PointResponse, defocus_bound, fisher_information
-from kornia_tidy.design.objectives import design
-from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.masks.base import MASK_SPAN, mask_coordinates
+from kornia_tidy.masks import MASK_SPAN, ZernikeMask, mask_coordinates
 from kornia_tidy.optics import circular_aperture
 
 

@@ -55,11 +55,6 @@ class TestCodedCandidate(BaseTester):
         assert 0 < more.depth_error < 12**-0.5
         assert (more.image_error != more.image_error) is (weight == 1)
 
-    def test_smoke_calls_back_at_each_step(self):
-        calls = []
-        coded_candidate(DesignTask(masks=1), "random", 40.0, 0.5, FEW, each_step=lambda: calls.append(1))
-        assert len(calls) == FEW
-
 
 class TestInitialPhase(BaseTester):
     @pytest.mark.parametrize("start", STARTS)

@@ -70,13 +70,6 @@ class TestRestoredByDepth(BaseTester):
             own = wiener(capture, bank.psfs[part : part + 1], 0.01 * 0.8**0.5)
             self.assert_close(both[..., columns], own[..., columns])
 
-    def test_cardinality_they_are_filtered_as_the_others(self):
-        bank, capture = gaussians([1.0, 2.0]), texture(32)
-        filters = depth_filters(bank, 0.01, PHOTOGRAPHS, (32, 32))
-        further = restored_by_depth(capture, filters, {"given": torch.full((2, 32, 32), 0.5)})
-        images = restorations(capture, WienerFilter(bank, 0.01, PHOTOGRAPHS, (32, 32)), further)
-        assert len(images) == (1 + 2 * len(NOISE_FACTORS)) * len(BILATERAL)
-
 
 class TestDepthLikelihood(BaseTester):
     def test_feature_finds_by_which_psf_a_texture_is_blurred(self):

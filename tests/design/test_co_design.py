@@ -10,12 +10,11 @@ import pytest
 import torch
 from safetensors.torch import load
 
-from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.design import DesignTask, Effort, co_design, planned_work
-from kornia_tidy.design.design_report import CAMERA, DATA, MASKS, design_files
+from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy.data import Scene
+from kornia_tidy.design import DesignTask, Effort, co_design, design_files, planned_work
+from kornia_tidy.design.design_report import CAMERA, DATA, MASKS
 from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes
-from kornia_tidy.sensor.sensor import SensorNoise
 from tests.base import BaseTester
 
 module = importlib.import_module("kornia_tidy.design.co_design")  # the package has a function of this name

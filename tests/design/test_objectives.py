@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, SensorNoise, Spectrum
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, PSFBank, SensorNoise, Spectrum
 from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics
-from kornia_tidy.design.fisher_information import crlb
-from kornia_tidy.design.objectives import design, point_error, restoration_error
+from kornia_tidy.design import crlb, design, restoration_error
+from kornia_tidy.design.objectives import point_error
 from kornia_tidy.masks import CubicMask
-from kornia_tidy.psf import PSFBank
-from kornia_tidy.psf.field_bank import FieldBank
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf import FieldBank, PSFModel
 from tests.base import BaseTester
 from tests.design.published_setting import design_fisher_mask
 

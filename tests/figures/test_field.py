@@ -34,11 +34,6 @@ class TestDrawLens(BaseTester):
         assert len(check_texts(figure, words)) == 3 + 10 + 3 + 15 + 9
         assert len(figure.axes) == 2 * 3 * 5 + 3
 
-    def test_feature_one_colour_and_one_height_are_drawn_too(self, tmp_path):
-        figure = draw_lens(of_lens(coma=1.0), field=1)
-        figure.savefig(tmp_path / "lens.png", dpi=40)
-        assert len(figure.axes) == 2 * 5 + 3
-
     def test_exception_no_lens(self):
         with pytest.raises(ValueError, match="a lens is drawn of a camera that has one, got none"):
             draw_lens(TiDyOptics(fidelity="draft"))

@@ -107,6 +107,14 @@ class TestMakeScenes(BaseTester):
         assert len(set.union(*paths)) == 12
         assert paths != [set(_photographs(settings.replace(seed=2), part)) for part in ("train", "validation", "test")]
 
+    def test_feature_a_folder_is_split_by_the_seed(self, roots):
+        settings = settings_of("rgbd-folder", roots)
+        parts = [names_of(make_scenes(settings, split)) for split in ("train", "validation", "test")]
+        assert set.union(*parts) == names_of(make_scenes(settings, "all")) == {f"{i:02d}" for i in range(PAIRS)}
+        assert parts == [names_of(make_scenes(settings, split)) for split in ("train", "validation", "test")]
+        tests = {min(names_of(make_scenes(settings.replace(seed=seed), "test"))) for seed in range(6)}
+        assert len(tests) > 2
+
     def test_feature_training_crops_follow_from_epoch_and_scene_whoever_loads_them(self, roots):
         """The picture's red and green say which row and column they were, and depth and mask come along."""
         scenes = make_scenes(settings_of("rgbd-folder", roots), "train")

@@ -47,6 +47,11 @@ class TestDesignedSettings(BaseTester):
         assert settings.camera().focus_distance == pytest.approx(4.0)  # the far end
         assert settings.mask_size == 23
 
+    def test_feature_a_recommended_lens_has_no_masks(self, tmp_path):
+        settings = designed_settings(folder_of_design(tmp_path / "a", -0.5))
+        assert (settings["masks"], settings["start"], settings["f_number"]) == (1, "flat", 41.0)
+        assert settings["focus_distance"] == pytest.approx(1 / (0.25 + 0.3 * 1.75))
+
     def test_feature_a_focus_at_infinity(self, tmp_path):
         folder = folder_of_design(tmp_path / "a", 1.5, DesignTask(masks=2))
         assert designed_settings(folder)["focus_distance"] == math.inf

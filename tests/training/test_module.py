@@ -83,6 +83,11 @@ class TestTidyTraining(BaseTester):
         self.assert_close(moved.median(), torch.tensor(1e-4), rtol=1e-2)
         assert {group["betas"] for group in optimizer.param_groups} == {(0.99, 0.999)}
 
+    def test_feature_a_fixed_lens_trains_the_network_alone(self):
+        module = made(masks=0)
+        assert not list(module.optics.parameters())
+        assert len(module.configure_optimizers().param_groups) == 1
+
     def test_feature_the_window_stays_when_masks_change(self):
         module = TidyTraining(TiDyOptics(PixelwiseMask(1, initial="flat")), nn.Identity())
         before = module.optics.window
@@ -215,6 +220,10 @@ class TestTidyTraining(BaseTester):
         wanted = ((2.4 / electrons) ** 2 + light / electrons).sqrt()
         self.assert_close(told[0][~reads], wanted, rtol=1e-4, atol=1e-6)
 
+    def test_exception_there_is_no_refiner(self):
+        with pytest.raises(ValueError, match="needs a JointClosedFormHead with a refiner"):
+            TidyTraining(build_optics(SETTINGS), nn.Identity(), learn="refiner")
+
     def test_feature_the_psnr_of_validation_is_that_of_the_clipped_image(self, monkeypatch):
         module, logged = made(task="edof", learn="network").eval(), {}
         monkeypatch.setattr(module, "forward", lambda coded, noise=None: coded + 5)
@@ -228,6 +237,10 @@ class TestTidyTraining(BaseTester):
     def test_exception_a_broken_batch_tells_why(self):
         with pytest.raises(ValueError, match="scene 3 is gone"):
             made().reconstruct(Broken("scene 3 is gone"))
+
+    def test_exception_unknown_task(self):
+        with pytest.raises(ValueError, match="task must be one of"):
+            TidyTraining(build_optics(SETTINGS), nn.Identity(), task="all")
 
 
 @pytest.fixture(scope="module")
@@ -283,6 +296,13 @@ class TestCheckpoint(BaseTester):
         coded = torch.rand(1, 3, 48, 48)
         with torch.no_grad():
             assert torch.equal(system.head(coded), module.eval()(coded))
+
+    def test_feature_weights_go_into_objects_of_ones_own(self, saved):
+        module, path = saved
+        optics, head = TiDyOptics(PixelwiseMask(2)), made().head
+        load_weights(path, optics, head)
+        assert torch.equal(optics.masks.phase, module.optics.masks.phase)
+        assert torch.equal(head.layers[0].weight, module.average.network.layers[0].weight)
 
     def test_exception_other_weights_are_refused_before_anything_is_loaded(self, saved):
         optics, head = TiDyOptics(PixelwiseMask(3)), made().head

@@ -104,6 +104,13 @@ class TestSceneLoader(BaseTester):
         assert torch.equal(before[0], torch.get_rng_state())
         assert before[1:] == (random.getstate(), np.random.get_state()[1].tolist())  # noqa: NPY002
 
+    def test_feature_noise_seeds_follow_the_scenes_and_the_epoch(self):
+        loader = SceneLoader(Noisy(), 1)
+        seeds = [batch["noise_seed"] for batch in loader]
+        loader._batches.set_epoch(1)
+        again = [batch["noise_seed"] for batch in loader]
+        assert len({*seeds, *again}) == 14
+
     @pytest.mark.parametrize("workers", [0, 1])
     def test_exception_a_broken_scene_is_told_by_its_reason_without_a_traceback(self, workers):
         batches = list(SceneLoader(Noisy(broken=3), 1, train=False, workers=workers))

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import time
 
 import pytest
 import torch
@@ -26,16 +25,6 @@ class TestSeconds(BaseTester):
         monkeypatch.setattr(costs, "LONG", 1.4)
         assert seconds(lambda: None, 5, CPU) == pytest.approx((0.4, 0.2))
         assert seconds(lambda: None, 5, CPU) == (9.0, 0.0)
-
-    def test_feature_one_repeat_has_no_spread(self):
-        timing = seconds(lambda: time.sleep(0.01), 1, CPU)
-        assert timing.median >= 0.01
-        assert timing.spread == 0
-
-    def test_cardinality_runs_once_more_than_it_counts(self):
-        runs = []
-        seconds(lambda: runs.append(1), 3, CPU)
-        assert len(runs) == 4
 
     def test_exception(self):
         with pytest.raises(ValueError, match="repeats must be 1 or more, got 0"):
@@ -63,10 +52,6 @@ class TestPeakBytes(BaseTester):
         backward = peak_bytes(lambda: torch.autograd.grad(x.exp().sum(), x), CPU)
         assert forward // 2**20 == 1
         assert backward // 2**20 >= 2
-
-    def test_feature_does_not_count_what_was_there_before(self):
-        x = torch.ones(2**20)
-        assert peak_bytes(lambda: x.add_(1), CPU) < 2**10
 
     @pytest.mark.takes_seconds
     def test_feature_is_the_same_on_every_run_and_says_nothing(self, capfd):

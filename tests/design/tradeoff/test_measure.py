@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, TiDyOptics
-from kornia_tidy.design.tradeoff import capture, measure, pareto, sweep, sweep_settings
-from kornia_tidy.design.tradeoff.sweep_settings import Setting
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.design.tradeoff import Setting, capture, measure, pareto, sweep, sweep_settings
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 from tests.design.tradeoff.samples import ROW
 

@@ -6,7 +6,7 @@ import pytest
 
 from kornia_tidy import Fidelity
 from kornia_tidy.design.tradeoff.sweep_settings import SWEEP_VALUES, sweep_settings
-from kornia_tidy.fidelity import LAYERS, PRESETS
+from kornia_tidy.fidelity import PRESETS
 from tests.base import BaseTester
 
 
@@ -28,11 +28,6 @@ class TestSweepSettings(BaseTester):
         settings = sweep_settings(base)
         for knob in SWEEP_VALUES:
             assert [s.fidelity for s in settings if s.knob == knob].count(PRESETS[base]) == 1
-
-    def test_feature_presets_and_modes_are_all_there(self):
-        settings = sweep_settings()
-        assert [s.value for s in settings if s.knob == "preset"] == list(PRESETS)
-        assert [s.value for s in settings if s.knob == "layers"] == list(LAYERS)
 
     def test_feature_a_setting_of_ones_own_is_a_base_too(self):
         base = Fidelity("mine", window=21)

@@ -23,6 +23,9 @@ class TestLayout(BaseTester):
         assert names[-1] == "00012.tar"
         assert [part.name for part in Layout().parts(2)] == ["000000", "000001"]
 
+    def test_feature_what_lies_beside_has_one_order(self):
+        assert Layout(beside=("mask", "image")) == Layout(beside=("image", "mask"))
+
     def test_exception_names_the_value(self):
         with pytest.raises(ValueError, match="must be one of 'image', 'depth', 'mask', got 'coded'"):
             Layout(beside=("coded",))

@@ -70,6 +70,10 @@ class TestDecodeSample(BaseTester):
         assert batch["coded"].shape == (5, 3, 48, 48)
         assert batch["index"].tolist() == [0, 1, 2, 3, 4]
 
+    def test_feature_other_files_of_a_sample_are_passed_on(self, folder):
+        sample = samples_of(next(folder.glob("*.tar")))[0]
+        assert decode_sample({**sample, "label.cls": b"3"})["label.cls"] == b"3"
+
     def test_exception_samples_that_are_damaged_or_no_capture(self, folder):
         sample = samples_of(sorted(folder.glob("*.tar"))[0])[0]
         picture = next(name for name in sample if name.startswith("coded"))
