@@ -41,7 +41,7 @@ from kornia_tidy.masks import (
 )
 from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, SpatialLightModulator
 from kornia_tidy.optics import camera_spectrum
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture, polygon_aperture
+from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
@@ -49,6 +49,7 @@ from kornia_tidy.render.pieces import Piece
 from kornia_tidy.render.stray_light import spread_evenly
 from tests.accuracy.adversarial_scenes import BORDERS, COMPOSITINGS, SCENES
 from tests.accuracy.planning_rig import Rig, smooth
+from tests.polygons import polygon_aperture
 
 TOLERANCES = (1e-2, 3e-3, 1e-3, 1e-4, 1e-5)
 NARROW = 65  # px that the reference's window may have here: of random masks it would have 257, and take minutes
@@ -75,7 +76,6 @@ APERTURES: dict[str, Callable[[int, torch.Generator], Tensor | None]] = {
     "smooth disc": lambda n, g: circular_aperture(n, 2.3 / n, edges="area"),
     "ring": lambda n, g: annular_aperture(n, 2.3 / n, _between(0.3, 0.75, g)),
     "triangle": lambda n, g: polygon_aperture(n, 2.3 / n, 3, _between(0, 6.3, g)),
-    "smooth triangle": lambda n, g: polygon_aperture(n, 2.3 / n, 3, _between(0, 6.3, g), edges="area"),
     "pixels": lambda n, g: _with_one((torch.rand(n, n, generator=g) > 0.6).double()),
     "grey pixels": lambda n, g: torch.rand(n, n, generator=g, dtype=torch.float64),
 }

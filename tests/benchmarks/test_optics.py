@@ -9,7 +9,7 @@ from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, Ti
 from kornia_tidy.design import autocorrelation_bound
 from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, SpatialLightModulator, Switching
-from kornia_tidy.optics import camera_spectrum, circular_aperture, polygon_aperture
+from kornia_tidy.optics import camera_spectrum, circular_aperture
 
 
 class TestOptics:
@@ -18,9 +18,6 @@ class TestOptics:
 
     def test_circular_aperture_by_area(self, bench):
         bench(lambda: circular_aperture(92, 0.025, edges="area"), size=0, pupil=92)
-
-    def test_polygon_aperture_by_area(self, bench):
-        bench(lambda: polygon_aperture(92, 0.025, 6, edges="area"), size=0, pupil=92)
 
     def test_camera_spectrum(self, bench):
         bench(lambda: camera_spectrum(samples=31), size=0, wavelengths=31)
