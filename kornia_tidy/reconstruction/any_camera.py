@@ -13,7 +13,7 @@ from torch.nn import functional
 from kornia_tidy.reconstruction.closed_form import closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.nafnet import NAFNet
-from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, RuledClosedForm
+from kornia_tidy.reconstruction.ruled_closed_form import CAMERA_MAPS, RuledClosedForm, Settings
 from kornia_tidy.reconstruction.state_file import read_state
 
 WEIGHTS = Path(__file__).parent / "pretrained" / "any-camera.safetensors"
@@ -28,9 +28,10 @@ FULL_ERROR, EXPONENT, MOST = 0.036, 1.7, 1.25
 class AnyCameraHead(ClosedFormHead):
     r"""Adds a share of a network's correction to the closed form, which knows the camera.
 
-    .. math:: \hat x = x_0 + \sigma(s) \, \Delta
+    .. math:: \hat x = x_0 + q \, \sigma(s) \, \Delta
 
-    The network estimates the correction :math:`\Delta`, and for each pixel the logit s of its share. Its inputs
+    The network estimates the correction :math:`\Delta`, and for each pixel the logit s of its share. q rises with the
+    error that is expected of the closed form (:func:`largest_share`): where that is near the truth it stays. Its inputs
     describe the camera: the maps of :class:`~kornia_tidy.reconstruction.ruled_closed_form.RuledClosedForm`. So one
     network serves all cameras: PSFs and noise are set, not learnt.
 
@@ -73,17 +74,27 @@ class AnyCameraHead(ClosedFormHead):
         self.network: NAFNet = network
         self.stride = network.stride
 
-    def predict(self, image: Tensor) -> Tensor:
-        """Return the image from the capture and the map of its noise, (B, 6, H, W)."""
-        capture, noise = image.split(3, 1)
-        restored = self.closed_form(capture, noise)
-        maps = self.network(restored.maps)
-        return corrected(restored.image, maps, self.largest_share(capture, noise))
+    def forward(self, image: Tensor, noise: Tensor | float | None = None) -> Tensor:
+        """Return the image, (B, 3, H, W)."""
+        self.check_image(image)
+        found = self.closed_form.settings_of(image, noise)  # of the capture, not of one that is padded
+        return self.on_grid(torch.cat([image, *(part.expand(-1, -1, *image.shape[-2:]) for part in found)], 1))
 
-    def largest_share(self, capture: Tensor, noise: Tensor) -> Tensor:
-        """Return the factor q of the share of a correction, (B, 1, 1, 1). See the class."""
-        error = self.closed_form.expected_error(capture, noise)
-        return ((error / FULL_ERROR) ** EXPONENT).clamp(max=MOST)
+    def predict(self, image: Tensor) -> Tensor:
+        """Return the image from the capture and three maps of its settings, (B, 6, H, W)."""
+        found = Settings(*image[:, 3:, :1, :1].split(1, 1))
+        restored = self.closed_form.restore_by(image[:, :3], found)
+        return corrected(restored.image, self.network(restored.maps), largest_share(self.closed_form, found.noise))
+
+
+def largest_share(form: RuledClosedForm, noise: Tensor) -> Tensor:
+    """Return the factor of the share of a correction, (B, 1, 1, 1), which rises with the expected error.
+
+    Args:
+        form: closed form of the camera.
+        noise: standard deviation of even noise, (B, 1, 1, 1), see :class:`Settings`.
+    """
+    return ((form.expected_error(noise) / FULL_ERROR) ** EXPONENT).clamp(max=MOST)
 
 
 @cache

@@ -177,7 +177,7 @@ class ClosedForm(nn.Module):
         self.inverse, self.fine = inverse, fine
         self.layers, self.bilateral, self.encoded, self.likelihood = layers, bilateral, encoded, likelihood
         self.mean_light: Tensor | None = None
-        self.detail: Tensor | None = None  # of the whole picture, as is the mean light
+        self.sample: list[Tensor] | None = None  # windows of the whole picture's light
         self.has_stray_light = False
         self.register_buffer("psfs", torch.zeros(layers or (NODES if inverse == "wiener" else 1), 3, 0, 0))
         self.register_buffer("veil", torch.zeros(3))  # share of stray light, mean over depth
@@ -263,13 +263,16 @@ class ClosedForm(nn.Module):
 
     def forward(self, capture: Tensor, noise: Tensor | float | None = None) -> Restoration:
         """Return the restored image, and the maps for a network."""
-        if not self.kernels.numel():
-            raise ValueError("the closed form does not know its camera: call set_psfs(optics.psf_bank()) first")
-        check_float_tensor("capture", capture, 4, "(B, 3, H, W)")
+        self._check(capture)
         precise = torch.promote_types(capture.dtype, self.kernels.dtype)
         with torch.autocast(capture.device.type, enabled=False):
             restored = self._restore(capture.to(precise), self.noise_map(capture.to(precise), noise))
         return Restoration(*(part.to(capture.dtype) for part in restored))
+
+    def _check(self, capture: Tensor) -> None:
+        if not self.kernels.numel():
+            raise ValueError("the closed form does not know its camera: call set_psfs(optics.psf_bank()) first")
+        check_float_tensor("capture", capture, 4, "(B, 3, H, W)")
 
     def blend(self, layers: Tensor, shares: Tensor, noise: Tensor) -> Tensor:
         """Return the light deconvolved for each depth, averaged pixel by pixel with the shares of depths, and smoothed.
@@ -285,10 +288,15 @@ class ClosedForm(nn.Module):
         precise = torch.promote_types(layers.dtype, self.kernels.dtype)
         with torch.autocast(layers.device.type, enabled=False):
             image = self._encode((shares.to(precise).unsqueeze(2) * layers.to(precise)).sum(1))
-            return self._smooth(image, self._color(noise.to(precise), image)).to(layers.dtype)
+            return self._smooth(image, self._color(noise.to(precise))).to(layers.dtype)
 
     def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
         light = self._without_stray_light(self._light(capture))
+        place = self._place(noise.clamp(min=LEAST_NOISE).log10())
+        return self._restored(capture, light, noise, place, self._color(noise))
+
+    def _restored(self, capture: Tensor, light: Tensor, noise: Tensor, place: Tensor, color: Tensor) -> Restoration:
+        """Restore light by the estimate at a place among those of the kernels, and smooth it by a width in colour."""
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
         brightness = light.mean(1, keepdim=True)
@@ -300,14 +308,15 @@ class ClosedForm(nn.Module):
             image = self._encode((shares.unsqueeze(2) * deconvolved).sum(1))
             by_depth = [self._brightness(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
         else:
-            image = self._encode(_interpolated(estimates, self._place(level, light)))
+            image = self._encode(interpolated(estimates, place))
             if self.layers:
                 by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
-        image = self._smooth(image, self._color(noise, light))
-        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
+        image = self._smooth(image, color)
+        told = estimates[:, -len(WEIGHTS) :]
+        maps = [capture, self._encode(told).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
         return Restoration(image, torch.cat(maps, 1), deconvolved)
 
-    def _place(self, level: Tensor, light: Tensor) -> Tensor:
+    def _place(self, level: Tensor) -> Tensor:
         """Return which of the estimates is best for the noise, given as its logarithm; between two a fraction."""
         above = level - math.log10(NOISE)
         if self.inverse == "tikhonov":
@@ -321,7 +330,7 @@ class ClosedForm(nn.Module):
     def _smooth(self, image: Tensor, color: Tensor) -> Tensor:
         return bilateral_filter(image, color, WINDOW, SPACE) if self.bilateral else image
 
-    def _color(self, noise: Tensor, light: Tensor) -> Tensor:
+    def _color(self, noise: Tensor) -> Tensor:
         """Return the width of the bilateral filter in colour."""
         return COLOR * 10 ** (COLOR_EXPONENT * _above(noise))
 
@@ -333,27 +342,18 @@ class ClosedForm(nn.Module):
         return rgb_to_linear_rgb(colors) if self.encoded else colors
 
     def _without_stray_light(self, light: Tensor) -> Tensor:
-        if not self.has_stray_light:
-            return light
+        return light - self._stray_light(light) if self.has_stray_light else light
+
+    def _stray_light(self, light: Tensor) -> Tensor:
+        """Return the stray light of a capture, or of the whole picture, (B, 3, 1, 1)."""
         mean = light.nan_to_num().mean((-2, -1), keepdim=True) if self.mean_light is None else self.mean_light.to(light)
         energy = self.psfs.mean(0).sum((-2, -1))
         share = (self.veil / (energy + self.veil)).to(light.dtype)
-        return light - share[:, None, None] * mean
+        return share[:, None, None] * mean
 
     def _encode(self, light: Tensor) -> Tensor:
         light = light.clamp(0, 1)
         return linear_rgb_to_rgb(light) if self.encoded else light
-
-
-def light_detail(light: Tensor) -> Tensor:
-    """Return the mean square difference of neighbouring pixels of each picture, (B, C, H, W) to (B,).
-
-    Example:
-        >>> light_detail(torch.tensor([[0.0, 1.0], [0.0, 1.0]]).view(1, 1, 2, 2))
-        tensor([0.5000])
-    """
-    along, down = (light.diff(dim=axis).square().nan_to_num().mean((1, 2, 3)) for axis in (-1, -2))
-    return (along + down).nan_to_num() / 2
 
 
 def _above(noise: Tensor) -> Tensor:
@@ -361,7 +361,7 @@ def _above(noise: Tensor) -> Tensor:
     return (noise.clamp(min=LEAST_NOISE).log10().mean(1, keepdim=True) - math.log10(NOISE)).clamp(min=0)
 
 
-def _interpolated(estimates: Tensor, place: Tensor) -> Tensor:
+def interpolated(estimates: Tensor, place: Tensor) -> Tensor:
     """Interpolate linearly between estimates (B, D, C, H, W) at a place (B, C, H, W) among them, from 0 to D - 1."""
     place = place.clamp(0, estimates.shape[1] - 1)
     steps = torch.arange(estimates.shape[1], device=place.device)[:, None, None, None]

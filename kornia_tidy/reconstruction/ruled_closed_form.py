@@ -1,66 +1,95 @@
-"""Restoration in closed form whose settings follow from the PSFs and the noise by one rule for all cameras."""
+"""Restoration in closed form whose settings follow from the PSFs, the noise and the capture by one rule."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
+from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.closed_form import (
     LEAST_NOISE,
+    SPACE,
     STEP,
     WIENER_NOISES,
+    WINDOW,
     ClosedForm,
     Restoration,
-    light_detail,
+    interpolated,
 )
+from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov import transfer_function
 from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
+from kornia_tidy.render.borders import next_fast_size, pad_border
 
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
 CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
-COLOR, SCENE_SHARE = 5.3, 0.3  # of the width in colour by the predicted error; share of the scene's part that counts
+FINER = 2  # kernels for less noise than those that a network is shown
+NOISES = tuple(WIENER_NOISES[0] * 10 ** (STEP * i) for i in range(-FINER, 0)) + WIENER_NOISES
+BEFORE_BILATERAL = 0.3  # of the variance of noise: how much the kernel takes it for, as a bilateral filter follows
 CONTENT = (0.03, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
 LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the scene
 STEPS = 20  # places between two kernels among which the best is sought
+COLORS = tuple(0.01 * 2 ** (i / 2) for i in range(11))  # 0.01 to 0.32, widths of the bilateral filter in colour
+USUAL, AROUND = 3.2, 2  # width in standard deviations of the restored noise about which it is sought, and steps
+PERTURBED = 0.1  # of the noise: by which the filter is perturbed to find how it takes noise
+NEAR = 5  # px, over which light is averaged to find by how much its noise is encoded
+SAMPLED, SAMPLES = 160, 2  # px, side of the windows from which settings follow; their largest number along an axis
 CAMERA_MAPS = 10
 """Maps that tell a network of the camera: validity, noise left by the filter, and in each of four bands of frequency
 the expected error and the mean transfer."""
 
 
+class Settings(NamedTuple):
+    """Settings of a capture's restoration."""
+
+    noise: Tensor
+    """Standard deviation of even noise with the mean variance of the capture's, in linear light, (B, 1, 1, 1)."""
+    place: Tensor
+    """Of the kernel among those of the closed form, (B, 1, 1, 1)."""
+    color: Tensor
+    """Width of the bilateral filter in colour, (B, 1, 1, 1); 0 for none."""
+
+
 class RuledClosedForm(ClosedForm):
-    r"""Wiener filter and bilateral filter with settings that follow from the PSFs and the noise of the capture.
+    r"""Wiener filter and bilateral filter with settings that follow from the PSFs, the noise and the capture.
 
-    The settings of :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm` were chosen behind one camera. Here
-    noise is even over the picture, with its mean variance :math:`\sigma^2`, and the kernel k minimises the predicted
-    error:
+    The settings of :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm` were chosen behind one camera. Here the
+    kernel k minimises the predicted error of the encoded picture:
 
-    .. math:: J(k) = r \int S \, \big\langle |1 - K H|^2 \big\rangle \, df + \sigma^2 \lVert k \rVert_2^2
+    .. math:: J(k) = r \int S \, \big\langle |1 - K H|^2 \big\rangle \, df + 0.3 \, s^2 \lVert k \rVert_2^2
 
-    S is the power spectrum of photographs, and r this scene's share of it: the power of differences between
-    neighbouring pixels of the capture, less that of noise, over the one that photographs would have behind this camera;
-    between .03 and 4. Kernels are of bounded size, so a PSF that fills its window is inverted less sharply. The width c
-    of the bilateral filter in colour follows the predicted error, of which the filter takes noise well and what the
-    kernel left of the scene less:
+    :math:`s^2 = \overline{(\sigma g'(y))^2}` is the mean variance of the encoded noise, g the encoding. S is the power
+    spectrum of photographs, and r this scene's share of it: the power of differences between neighbouring pixels of
+    the encoded capture, less that of noise, over the one that photographs would have behind this camera; between .03
+    and 4 times :math:`\overline{g'^2}`. Noise counts by .3, as the bilateral filter takes noise away. Kernels are of
+    bounded size, so a PSF that fills its window is inverted less sharply.
 
-    .. math:: c = 5.3 \, \sqrt{\sigma^2 \lVert k \rVert_2^2 + 0.3 \, r \int S \, \langle |1 - K H|^2 \rangle \, df}
+    The width c of the bilateral filter B in colour is the one of the least risk that Stein's estimate predicts for the
+    picture u that the kernel restored,
 
-    The form was found on painted scenes behind the training cameras of ``tests/benchmarks/any_camera``, its two numbers
-    on six real scenes of half A. ``docs/record`` says how near it comes to the best choice behind each camera.
+    .. math:: R(c) = \overline{|B(u) - u|^2} + 2 \, \overline{n \cdot \partial_n B(u)},
+
+    where n is noise drawn as the capture has it, restored and encoded as the capture is; its derivative is a difference.
+    So texture beyond the noise is kept, and behind sharp optics in bright light c is 0.
+
+    The rule and its numbers were found on real scenes of half A behind the training cameras of
+    ``tests/benchmarks/any_camera``. ``docs/record`` says how near it comes to the best choice behind each camera.
 
     Args:
         layers: number of depths with a deconvolution of the brightness for each, as inputs of a network.
         encoded: captures are encoded as sRGB. False: they are linear light.
 
     Shape:
-        - capture: (B, 3, H, W); clipped pixels may hold more than 1, see
-          :func:`~kornia_tidy.reconstruction.clipped.estimate_clipped`.
-        - noise: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`; its mean variance is taken.
+        - capture: (B, 3, H, W).
+        - noise: as for :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
         - output: :class:`~kornia_tidy.reconstruction.closed_form.Restoration`, with ``CAMERA_MAPS`` more maps.
 
     Raises:
@@ -68,10 +97,14 @@ class RuledClosedForm(ClosedForm):
         ValueError: as :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm`.
 
     Convention:
-        - For tiles the mean of the noise follows from the mean light of the whole picture, see
-          :func:`~kornia_tidy.reconstruction.whole_picture.whole_picture`.
+        - Settings are the same all over a picture, and follow from four windows of it. Tiles take those of the whole
+          picture, see :func:`~kornia_tidy.reconstruction.whole_picture.whole_picture`; a map of noise that does not
+          follow from the sensor then counts by its mean over the tile.
+        - No gradient reaches the settings.
 
-    Source: Wiener (1949); Tomasi and Manduchi, Bilateral Filtering (ICCV 1998).
+    Source: Wiener (1949); Tomasi and Manduchi, Bilateral Filtering (ICCV 1998); Stein, Estimation of the mean of a
+    multivariate normal distribution (Annals of Statistics 9(6), 1981); Ramani, Blu and Unser, Monte-Carlo SURE (IEEE
+    TIP 17(9), 2008).
 
     Example:
         >>> from kornia_tidy.psf.psf_bank import PSFBank
@@ -87,83 +120,184 @@ class RuledClosedForm(ClosedForm):
     scene_errors: Tensor
     photographs_detail: Tensor
     bands: Tensor
+    drawn: Tensor
 
     def __init__(self, layers: int = 0, *, encoded: bool = True) -> None:
         super().__init__(layers, encoded=encoded, inverse="wiener")
-        kinds = len(WIENER_NOISES)
-        for name, shape in (("norms", (kinds,)), ("scene_errors", (kinds,)), ("photographs_detail", ())):
+        places = STEPS * (len(NOISES) - 1) + 1
+        for name, shape in (("norms", (places,)), ("scene_errors", (places,)), ("photographs_detail", ())):
             self.register_buffer(name, torch.ones(shape), persistent=False)
-        self.register_buffer("bands", torch.zeros(2, kinds, len(BANDS) + 1), persistent=False)
+        self.register_buffer("bands", torch.zeros(2, len(WIENER_NOISES), len(BANDS) + 1), persistent=False)
+        drawn = torch.randn(3, SAMPLED, SAMPLED, generator=torch.Generator().manual_seed(0))
+        self.register_buffer("drawn", drawn, persistent=False)
 
     def _set_kernels(self, psfs: Tensor) -> None:
         super()._set_kernels(psfs)
-        psfs, kernels = psfs.detach().to(self.kernels.dtype), self.kernels.detach()
-        self.norms = kernels.square().sum((-2, -1)).mean(1).sqrt()
-        self.scene_errors, self.photographs_detail = predicted_errors(psfs, kernels)
+        psfs = psfs.to(self.kernels.dtype)
+        self.kernels = torch.cat([wiener_kernels(psfs, NOISES[:FINER]), self.kernels])
+        psfs, kernels = psfs.detach(), self.kernels.detach()
+        between = torch.stack([kernels[:-1], (kernels[:-1] + kernels[1:]) / 2], 1).flatten(0, 1)
+        halves = torch.cat([between, kernels[-1:]])
+        errors, self.photographs_detail = predicted_errors(psfs, halves)
+        self.scene_errors = _parabolas(errors)
+        self.norms = _parabolas(halves.square().sum((-2, -1)).mean(1)).sqrt()
         self.bands = band_facts(psfs)
 
-    def noise_map(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
-        """Return the standard deviation of even noise with the mean variance of the capture's, (B, 3, H, W)."""
-        if noise is None and self.mean_light is not None:
-            dark, rise = self.noise_model.to(capture.dtype)
-            variance = dark + rise * self.mean_light.to(capture).clamp(0, 1).mean(1, keepdim=True)
-        else:
-            each = super().noise_map(capture, noise).square().nan_to_num()
-            variance = each.mean((1, 2, 3), keepdim=True)
-        return variance.sqrt().expand(capture.shape)
+    def settings_of(self, capture: Tensor, noise: Tensor | float | None = None) -> Settings:
+        """Return the settings of a capture, in its dtype; for arguments see the class."""
+        self._check(capture)
+        precise = capture.to(torch.promote_types(capture.dtype, self.kernels.dtype))
+        with torch.autocast(capture.device.type, enabled=False):
+            light = self._without_stray_light(self._light(precise))
+            found = self.settings(light, self.noise_map(precise, noise))
+        return Settings(*(part.to(capture.dtype) for part in found))
+
+    def restore_by(self, capture: Tensor, found: Settings) -> Restoration:
+        """Return the restored image, and the maps for a network, with settings that are known."""
+        precise = torch.promote_types(capture.dtype, self.kernels.dtype)
+        with torch.autocast(capture.device.type, enabled=False):
+            restored = self._by(capture.to(precise), Settings(*(part.to(precise) for part in found)))
+        return Restoration(*(part.to(capture.dtype) for part in restored))
 
     def _restore(self, capture: Tensor, noise: Tensor) -> Restoration:
-        restored = super()._restore(capture, noise)
-        maps = [capture.clamp(max=1), restored.maps[:, 3:], self._camera_maps(capture, noise[:, :1, :1, :1])]
-        return restored._replace(maps=torch.cat(maps, 1))
+        return self._by(capture, self.settings(self._without_stray_light(self._light(capture)), noise))
 
-    def expected_error(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
+    def _by(self, capture: Tensor, found: Settings) -> Restoration:
+        light = self._without_stray_light(self._light(capture))
+        restored = self._restored(capture, light, found.noise.expand_as(capture), found.place, found.color)
+        return restored._replace(maps=torch.cat([restored.maps, self._camera_maps(capture, found.noise)], 1))
+
+    def _smooth(self, image: Tensor, color: Tensor) -> Tensor:
+        smoothed = bilateral_filter(image, color.clamp(min=COLORS[0]), WINDOW, SPACE)
+        return torch.where(color > 0, smoothed, image)
+
+    def expected_error(self, noise: Tensor) -> Tensor:
         """Return the root mean square error of photographs that is expected behind this camera, in linear light.
 
         Args:
-            capture: (B, 3, H, W).
-            noise: as for :meth:`forward`.
+            noise: standard deviation of even noise, (B, 1, 1, 1), as :class:`Settings` have it.
 
         Returns:
-            (B, 1, 1, 1), of scenes with as much detail as photographs have, by the kernel that the capture gets.
+            (B, 1, 1, 1), by the best kernel for scenes with as much detail as photographs have.
         """
-        even = self.noise_map(capture, noise)[:, :1, :1, :1].clamp(min=LEAST_NOISE)
-        place, _, left = self._best(even, self._light(capture))
-        return (left + _at(self.scene_errors.log()[:, None], place).exp()[:, :, None, None]).sqrt()
+        left = (noise.flatten()[:, None] * self.norms.to(noise)).square()
+        return (left + self.scene_errors.to(noise)).min(1).values.sqrt()[:, None, None, None]
 
-    def _place(self, level: Tensor, light: Tensor) -> Tensor:
-        return self._best(10 ** level[:, :1, :1, :1], light)[0]
+    @torch.no_grad()
+    def settings(self, light: Tensor, noise: Tensor) -> Settings:
+        """Return how captures are restored.
 
-    def _color(self, noise: Tensor, light: Tensor) -> Tensor:
-        _, scene, left = self._best(noise[:, :1, :1, :1].clamp(min=LEAST_NOISE), light)
-        return COLOR * (left + SCENE_SHARE * scene).sqrt()
+        Args:
+            light: (B, 3, H, W), linear, without stray light.
+            noise: standard deviation in linear light, (B, 3, H, W).
+        """
+        windows = self._windows(light, noise)
+        facts = zip(*(self._facts(*one) for one in windows), strict=True)
+        detail, variance, slope = (torch.stack(each).mean(0) for each in facts)
+        power = (detail - 2 * variance).clamp(min=LEAST_DETAIL * variance) / self.photographs_detail.to(light)
+        content = power.maximum(CONTENT[0] * slope).minimum(CONTENT[1] * slope)
+        left = BEFORE_BILATERAL * variance[:, None] * self.norms.square().to(light)
+        cost = content[:, None] * self.scene_errors.to(light) + left
+        place = cost.argmin(1)[:, None, None, None].to(light) / STEPS
+        squares = [part.square().nan_to_num().mean((1, 2, 3), keepdim=True) for _, part in windows]
+        even = torch.stack(squares).mean(0).sqrt().clamp(min=LEAST_NOISE)
+        return Settings(even, place, self._color_of_least_risk(windows, place))
 
-    def _best(self, noise: Tensor, light: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the place of the kernel with the least predicted error, and both parts of it, all (B, 1, 1, 1)."""
-        detail = light_detail(light) if self.detail is None else self.detail.to(light)
-        variance = noise.flatten().square()
-        power = (detail - 2 * variance).clamp(min=LEAST_DETAIL * variance)
-        content = (power / self.photographs_detail.to(light)).clamp(*CONTENT)
-        logs = torch.stack([self.scene_errors, self.norms.square()]).clamp(min=1e-12).log().double()
-        curve = _cubic(len(self.norms), STEPS).to(logs.device)
-        scene = content[:, None] * (curve @ logs[0]).exp().to(light)
-        left = variance[:, None] * (curve @ logs[1]).exp().to(light)
-        best = (scene + left).argmin(1, keepdim=True)
-        parts = (best / STEPS, scene.gather(1, best), left.gather(1, best))
-        return tuple(part.to(light)[:, :, None, None] for part in parts)  # ty: ignore[invalid-explicit-return]
+    def _windows(self, light: Tensor, noise: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return windows of light without stray light, and of its noise: of the whole picture, if it is known."""
+        if self.sample is None:
+            return list(zip(sampled_windows(light), sampled_windows(noise), strict=True))
+        windows = [self._without_stray_light(part.to(light)) for part in self.sample]
+        dark, rise = self.noise_model.to(light)
+        by_sensor = [(dark + rise * part.to(light).clamp(0, 1)).sqrt() for part in self.sample]
+        even = noise.square().nan_to_num().mean((1, 2, 3), keepdim=True).sqrt()
+        # noise of the sensor differs from window to window, one that is told does not
+        seen = light + self._stray_light(light) if self.has_stray_light else light
+        own = (dark + rise * seen.clamp(0, 1)).sqrt()
+        follows = ((own - noise).abs() <= 1e-3 * noise).flatten(1).float().mean(1)[:, None, None, None] > 0.5
+        return [(w, torch.where(follows, n, even)) for w, n in zip(windows, by_sensor, strict=True)]
+
+    def _facts(self, light: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return detail and variance of noise of the encoded light, and the mean squared slope of the code, (B,)."""
+        slope = self._slope(light)
+        squares = [(slope * noise).square(), slope.square()]
+        variance, steep = (part.nan_to_num().mean((1, 2, 3)) for part in squares)
+        return light_detail(self._encode(light.nan_to_num())), variance, steep
+
+    def _slope(self, light: Tensor) -> Tensor:
+        """Return the derivative of the encoding at the mean light about each pixel."""
+        if not self.encoded:
+            return torch.ones_like(light)
+        border = NEAR // 2
+        padded = pad_border(light.nan_to_num(), border, "replicate")
+        near = functional.avg_pool2d(padded, NEAR, 1)
+        curved = 1.055 / 2.4 * near.clamp(min=0.0031308) ** (1 / 2.4 - 1)
+        return torch.where(near > 0.0031308, curved, 12.92)  # IEC 61966-2-1
+
+    def _color_of_least_risk(self, windows: list[tuple[Tensor, Tensor]], place: Tensor) -> Tensor:
+        """Return the width in colour with the least risk over all windows, (B, 1, 1, 1)."""
+        kernels = interpolated(self.kernels.detach().to(place).expand(len(place), -1, -1, -1, -1), place)
+        pairs = [self._perturbed(light, noise, kernels) for light, noise in windows]
+        deviation = torch.stack([noise.square().mean((1, 2, 3)) for _, _, noise in pairs]).mean(0).sqrt()
+        steps = deviation.new_tensor(COLORS)
+        usual = (USUAL * deviation[:, None] / steps).log().abs().argmin(1)
+        choices = [(usual + step).clamp(0, len(COLORS) - 1) for step in range(-AROUND, AROUND + 1)]
+        risks = [2 * deviation.square()]
+        for choice in choices:
+            color = steps[choice][:, None, None, None]
+            risks.append(torch.stack([_risk(*pair, color) for pair in pairs]).mean(0))
+        colors = torch.stack([torch.zeros_like(deviation), *(steps[choice] for choice in choices)], 1)
+        return colors.gather(1, torch.stack(risks, 1).argmin(1, keepdim=True))[:, :, None, None]
+
+    def _perturbed(self, light: Tensor, noise: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the picture that the kernels restore, the same with a little more noise, and that noise restored."""
+        rows, columns = light.shape[-2:]
+        light, noise = light.nan_to_num(), noise.nan_to_num()
+        pair = torch.stack([light, light + PERTURBED * noise * self.drawn[:, :rows, :columns].to(light)], 1)
+        one, other = torch.stack(
+            [convolve_kernels(two, kernel[None])[:, 0] for two, kernel in zip(pair, kernels, strict=True)], 1
+        )
+        first, second = self._encode(one), self._encode(other)
+        return first, second, (second - first) / PERTURBED
 
     def _left(self, noise: Tensor, place: Tensor) -> Tensor:
         """Return the standard deviation of the noise that a kernel leaves of even noise, all (B, 1, 1, 1)."""
-        curve = (_at(self.norms.log()[:, None], place)).exp()
-        return noise * curve[:, :, None, None]
+        return noise * _at(self.norms[:, None], STEPS * place)[:, :, None, None]
 
     def _camera_maps(self, capture: Tensor, noise: Tensor) -> Tensor:
         """Return maps of the camera's and each pixel's properties, (B, CAMERA_MAPS, H, W)."""
-        noise = noise.clamp(min=LEAST_NOISE)
-        place = (noise.log10() - math.log10(WIENER_NOISES[0])) / STEP
-        facts = [self._left(noise, place)[..., 0, 0].log10() + 2, *(_at(table, place) for table in self.bands)]
+        place = ((noise.log10() - math.log10(WIENER_NOISES[0])) / STEP).clamp(min=0)
+        facts = [self._left(noise, FINER + place)[..., 0, 0].log10() + 2, *(_at(table, place) for table in self.bands)]
         told = torch.cat(facts, 1).to(capture)[:, :, None, None].expand(-1, -1, *capture.shape[-2:])
         return torch.cat([(capture < CLIPPED).all(1, keepdim=True).to(capture), told], 1)
+
+
+def sampled_windows(picture: Tensor) -> list[Tensor]:
+    """Return windows of a picture (B, C, H, W), at most two along each axis, about its quarters.
+
+    Example:
+        >>> [tuple(part.shape) for part in sampled_windows(torch.zeros(1, 3, 100, 400))]
+        [(1, 3, 100, 160), (1, 3, 100, 160)]
+    """
+    places = []
+    for length in picture.shape[-2:]:
+        side = min(SAMPLED, length)
+        count = 1 if length <= SAMPLED else SAMPLES
+        middles = [(2 * index + 1) * length // (2 * count) for index in range(count)]
+        firsts = [min(max(0, middle - side // 2), length - side) for middle in middles]
+        places.append([slice(first, first + side) for first in firsts])
+    return [picture[..., rows, columns] for rows in places[0] for columns in places[1]]
+
+
+def light_detail(light: Tensor) -> Tensor:
+    """Return the mean square difference of neighbouring pixels of each picture, (B, C, H, W) to (B,).
+
+    Example:
+        >>> light_detail(torch.tensor([[0.0, 1.0], [0.0, 1.0]]).view(1, 1, 2, 2))
+        tensor([0.5000])
+    """
+    along, down = (light.diff(dim=axis).square().nan_to_num().mean((1, 2, 3)) for axis in (-1, -2))
+    return (along + down).nan_to_num() / 2
 
 
 def predicted_errors(psfs: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor]:
@@ -251,18 +385,20 @@ def _scene_power(side: int) -> Tensor:
     return power
 
 
-@lru_cache(maxsize=1)
-def _cubic(nodes: int, steps: int) -> Tensor:
-    """Return the matrix that interpolates values at nodes by their polynomial, ``steps`` places from each to the next.
+def _risk(first: Tensor, second: Tensor, noise: Tensor, color: Tensor) -> Tensor:
+    """Return Stein's estimate of the risk of a bilateral filter, but for a constant, (B,)."""
+    taken, other = (bilateral_filter(image, color, WINDOW, SPACE) for image in (first, second))
+    kept = noise * (other - taken) / PERTURBED
+    return ((taken - first).square() + 2 * kept).mean((1, 2, 3))
 
-    Source: Lagrange's formula.
-    """
-    places = torch.arange((nodes - 1) * steps + 1, dtype=torch.float64) / steps
-    columns = []
-    for own in range(nodes):
-        others = [other for other in range(nodes) if other != own]
-        columns.append(torch.stack([(places - other) / (own - other) for other in others]).prod(0))
-    return torch.stack(columns, 1)
+
+def _parabolas(halves: Tensor) -> Tensor:
+    """Interpolate a square of what is linear between nodes, from its values at the nodes and midway, (N,)."""
+    first, middle, last = halves[:-2:2], halves[1::2], halves[2::2]
+    place = torch.arange(STEPS, dtype=halves.dtype, device=halves.device) / STEPS
+    bent, rise = 2 * (first - 2 * middle + last), 4 * middle - 3 * first - last
+    curves = first[:, None] + place * (rise[:, None] + place * bent[:, None])
+    return torch.cat([curves.flatten(), halves[-1:]]).clamp(min=0)
 
 
 def _at(table: Tensor, place: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Mean light of a whole picture, told to the closed forms in a network that see parts of it."""
+"""Mean light and windows of a whole picture, told to the closed forms in a network that see parts of it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.closed_form import ClosedForm, light_detail
+from kornia_tidy.reconstruction.closed_form import ClosedForm
+from kornia_tidy.reconstruction.ruled_closed_form import sampled_windows
 
 
 @contextmanager
@@ -37,17 +38,17 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     parts = closed_forms_without_statistics(head)
     if parts:
         strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
-        lights = (rgb_to_linear_rgb(strip) if encoded else strip for strip in strips)
-        sums = [(light.sum((-2, -1)), light.shape[-2] * light_detail(light)) for light in lights]
-        total, detail = (torch.stack(each).sum(0) for each in zip(*sums, strict=True))
+        total = sum((rgb_to_linear_rgb(strip) if encoded else strip).sum((-2, -1)) for strip in strips)
         mean = total[..., None, None] / (picture.shape[-2] * picture.shape[-1])
+        parts_of_it = [part.clamp(0, 1) for part in sampled_windows(picture)]
+        sample = [rgb_to_linear_rgb(part) if encoded else part for part in parts_of_it]
     try:
         for part in parts:
-            part.mean_light, part.detail = mean.to(part.psfs), (detail / picture.shape[-2]).to(part.psfs)
+            part.mean_light, part.sample = mean.to(part.psfs), sample
         yield
     finally:
         for part in parts:
-            part.mean_light = part.detail = None
+            part.mean_light = part.sample = None
 
 
 def closed_forms_without_statistics(head: nn.Module) -> list[ClosedForm]:

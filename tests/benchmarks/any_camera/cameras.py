@@ -51,15 +51,16 @@ class Pool:
 
 POOLS = {
     "training": Pool(48, (5.0, 50.0), (2.5e-6, 9e-6), FAMILIES),
+    "sharp": Pool(16, (5.0, 16.0), (5e-6, 9.5e-6), ("flat",)),  # as those above, for training
     "validation": Pool(8, (4.5, 55.0), (2.2e-6, 9.5e-6), FAMILIES, hard=3),
     "test": Pool(12, (4.0, 60.0), (2e-6, 10e-6), (*FAMILIES, "cubic", "fresnel"), hard=5),
 }
 
 
 def pool_names(pool: str) -> list[str]:
-    """Return the names of the cameras of a pool; those of training begin with the shipped ones."""
+    """Return the names of the cameras of a pool; those of training begin with the shipped ones, and end with sharp ones."""
     drawn = [f"{pool}-{index:02d}" for index in range(POOLS[pool].count)]
-    return [*SHIPPED, *drawn] if pool == "training" else drawn
+    return [*SHIPPED, *drawn, *pool_names("sharp")] if pool == "training" else drawn
 
 
 def camera(name: str) -> TiDyOptics:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
@@ -22,7 +20,7 @@ from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera
 from tests.benchmarks.any_camera.scores import READ_ELECTRONS, scored_scenes
-from tests.benchmarks.any_camera.training import demosaiced, shifted
+from tests.benchmarks.any_camera.training import compressed, demosaiced, shifted
 
 CAMERA, ELECTRONS = "edof-designed", 57_000.0
 SHIFT = 0.04  # radii of the pupil, 2 % of its diameter
@@ -32,14 +30,6 @@ def with_hot_pixels(light: Tensor, share: float = 1e-3) -> Tensor:
     """Return a capture in which a share of the values is at full scale or zero, half each."""
     drawn = torch.rand(light.shape, generator=torch.Generator().manual_seed(1))
     return torch.where(drawn < share / 2, 1.0, torch.where(drawn < share, 0.0, light))
-
-
-def compressed(light: Tensor, quality: int) -> Tensor:
-    """Return a capture as JPEG keeps it."""
-    pixels = (linear_rgb_to_rgb(light)[0].permute(1, 2, 0).flip(-1).numpy() * 255).round().astype(np.uint8)
-    data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    read = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
-    return rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected
+from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, largest_share
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.metrics import psnr
@@ -61,8 +61,7 @@ class Capturing:
 
     def __init__(self, name: str) -> None:
         self.optics = camera(name)
-        self.head = AnyCameraHead(width=1)  # for its share
-        self.form = self.head.closed_form
+        self.form = RuledClosedForm(7)
         self.form.set_psfs(closed_form_bank(self.optics, self.form.layers))
 
     def captures(self, scenes: list[BenchScene]) -> Iterator[tuple[BenchScene, float, Tensor, Tensor]]:
@@ -99,8 +98,8 @@ def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, t
     head = load_pretrained(name).head if name in SHIPPED else None
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
-        restored = own.form(capture, noise)
-        largest = own.head.largest_share(capture, noise)
+        found = own.form.settings_of(capture, noise)
+        restored, largest = own.form.restore_by(capture, found), largest_share(own.form, found.noise)
         images = {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:
             images["own"] = head(capture, noise=noise)

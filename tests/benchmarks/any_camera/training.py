@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb, rgb_to_linear_rgb
@@ -21,7 +22,7 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera
+from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera, largest_share
 from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.pretrained import load_pretrained
@@ -43,10 +44,10 @@ READ_ELECTRONS = (1.0, 5.0)
 NOISE_ERROR = 1.5  # largest factor by which the noise told is wrong
 BITS = (8, 10, 12, 14, 16)
 RATE, WARM_UP = 3e-4, 50
-DECAY = 0.998
+DECAY = 0.995
 SHIPPED_SHARE = 0.25
 START = "edof-5"
-SAVED_EVERY = 100  # steps
+SAVED_EVERY = 50  # steps
 
 
 OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
@@ -54,8 +55,10 @@ MISTAKEN, MISTAKES = 0.35, 2  # share of draws with PSFs of a camera that is a l
 LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors: of lengths; of the mask, in radii of the pupil; of focus, in radians
 DEMOSAICED = 0.2  # share of draws behind a Bayer filter
 GRAINY = 0.4  # share of draws whose scene has grain, which the optics blur and a network should keep
+COMPRESSED, QUALITIES, TOLD_AS_JPEG = 0.1, (85, 98), 0.006  # share of draws as JPEG; its quality; a noise told for it
+LOSS_OF_HARM = 1.0  # of a picture that is worse than the closed form's, beside its loss: for each decibel behind
 COLLAGES = 0.5  # share of draws of collages of photographs, where there are any
-PULL = 3e-4  # of the weights towards those of the start, for each step at the full rate
+PULL = 3e-4  # of the weights towards the first ones, for each step at the full rate
 
 
 class Cameras:
@@ -139,6 +142,14 @@ def with_grain(light: Tensor, image: Tensor, form: RuledClosedForm, random: torc
     return (light + blurred).clamp(0, 1), grainy
 
 
+def compressed(light: Tensor, quality: int) -> Tensor:
+    """Return a capture as JPEG keeps it."""
+    pixels = (linear_rgb_to_rgb(light)[0].permute(1, 2, 0).flip(-1).numpy() * 255).round().astype(np.uint8)
+    data = cv2.imencode(".jpg", np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    read = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    return rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)
+
+
 def demosaiced(light: Tensor) -> Tensor:
     """Return pictures as behind a Bayer filter, interpolated linearly."""
     mosaic = torch.zeros_like(light[:, :1])
@@ -148,8 +159,8 @@ def demosaiced(light: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the closed form's image, the maps for the network, the truth, and where the capture is not clipped.
+def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return the closed form's image, maps for the network, truth, where captures are not clipped, largest shares.
 
     They follow from the step alone.
     """
@@ -161,7 +172,7 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         names = SHIPPED if shipped else cameras.names[len(SHIPPED) :]
         name = names[int(torch.randint(len(names), (), generator=random))]
         light, image = cameras.crops(name, CROPS_A_CAMERA, random)
-        chance = torch.rand(5, generator=random, dtype=torch.float64).tolist()
+        chance = torch.rand(7, generator=random, dtype=torch.float64).tolist()
         gain = random_gain(torch.maximum(light.amax((0, 2, 3)), image.amax((0, 2, 3))))
         if chance[0] < OVEREXPOSED:
             gain = gain * 4 ** (chance[0] / OVEREXPOSED)
@@ -172,10 +183,18 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         told = sensor.std(noisy) * NOISE_ERROR ** (2 * chance[1] - 1)
         if chance[2] < DEMOSAICED:
             noisy = demosaiced(noisy)
+        if chance[5] < COMPRESSED:
+            low, high = QUALITIES
+            noisy = torch.cat([compressed(one[None], round(low + (high - low) * chance[6])) for one in noisy])
+            told = told.clamp(min=TOLD_AS_JPEG) if chance[5] < COMPRESSED / 2 else told
         form = cameras.form(name, 1 + int(chance[3] / MISTAKEN * MISTAKES) if chance[3] < MISTAKEN else 0)
-        restored = form(linear_rgb_to_rgb(noisy), told)
+        capture = linear_rgb_to_rgb(noisy)
+        found = form.settings_of(capture, told)
+        restored = form.restore_by(capture, found)
+        largest = largest_share(form, found.noise).expand(-1, 1, *capture.shape[-2:])
         truth = linear_rgb_to_rgb((image * gain).clamp(0, 1))
-        parts.append((restored.image, restored.maps, truth, (noisy < CLIPPED).all(1, keepdim=True)))
+        known = (noisy < CLIPPED).all(1, keepdim=True)
+        parts.append((restored.image, restored.maps, truth, known, largest))
     whole = [torch.cat(part) for part in zip(*parts, strict=True)]
     turns, mirrored = int(torch.randint(4, (), generator=random)), bool(torch.randint(2, (), generator=random))
     turned = [part.rot90(turns, (2, 3)) for part in whole]
@@ -190,13 +209,19 @@ def start() -> AnyCameraHead:
     return head
 
 
+def losses(estimate: Tensor, truth: Tensor, known: Tensor) -> Tensor:
+    """Return the loss of each picture, (B,)."""
+    parts = zip(*(part.split(1) for part in (estimate, truth, known)), strict=True)
+    return torch.stack([psnr_ssim_loss(*one) for one in parts])
+
+
 def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
     """Train; goes on from the checkpoint in the folder, and ends after so many steps or minutes."""
     cameras, path = Cameras(folder / "captures", "training"), folder / "checkpoint.pt"
     network = start().network.train().to(memory_format=torch.channels_last)
-    anchor = [part.detach().clone() for part in network.parameters()]
     if (first := folder / "first.pt").exists():
         network.load_state_dict(torch.load(first, weights_only=True))
+    anchor = [part.detach().clone() for part in network.parameters()]
     average = MovingAverage(network, DECAY)
     optimizer = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.99), weight_decay=0.0)
     step, log = 0, []
@@ -211,9 +236,10 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
         for group in optimizer.param_groups:
             falling = 0.5 * (1 + math.cos(math.pi * step / steps))
             group["lr"] = RATE * min(1, (step + 1) / WARM_UP) * (0.05 + 0.95 * falling)
-        first, maps, truth, known = batch(cameras, step)
-        estimate = corrected(first, network(maps.contiguous(memory_format=torch.channels_last)))
-        loss = psnr_ssim_loss(estimate, truth, known)
+        first, maps, truth, known, largest = batch(cameras, step)
+        estimate = corrected(first, network(maps.contiguous(memory_format=torch.channels_last)), largest)
+        each, without = losses(estimate, truth, known), losses(first, truth, known)
+        loss = (each + LOSS_OF_HARM * (each - without).clamp(min=0)).mean()
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -223,8 +249,7 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
                 part.lerp_(origin, PULL * group["lr"] / RATE)
         average.update(network)
         step += 1
-        with torch.no_grad():
-            log.append([float(loss), float(psnr_ssim_loss(first, truth, known))])
+        log.append([float(each.detach().mean()), float(without.mean())])
         if step % SAVED_EVERY == 0 or step == steps:
             recent = np.mean(log[-SAVED_EVERY:], 0)
             seconds = time.monotonic() - began
