@@ -21,7 +21,8 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
-from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system
+from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system, sensor_of
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
@@ -105,7 +106,7 @@ def simulate(
 
 def reconstruct(
     capture: NDArray[Any],
-    system: TiDyOptics | TrainedSystem | LightHead | str | os.PathLike[str] = "joint-uncertain",
+    system: TiDyOptics | PSFBank | TrainedSystem | LightHead | str | os.PathLike[str] = "joint-uncertain",
     *,
     color: Color = "bgr",
     linear: bool = False,
@@ -116,7 +117,8 @@ def reconstruct(
     Args:
         capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
         system: the camera or the trained system of the captures. The network for any camera restores those of a
-            :class:`~kornia_tidy.TiDyOptics`, or of the file of one. A system is a name of
+            :class:`~kornia_tidy.TiDyOptics`, of the file of one, or of a :class:`~kornia_tidy.PSFBank`, whose noise is
+            measured in the first capture. A system is a name of
             :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or an argument or result of
             :func:`~kornia_tidy.reconstruction.hub.from_pretrained`. For many calls with a system of your
             own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.
@@ -141,8 +143,10 @@ def reconstruct(
         ((32, 48, 3), None)
     """
     pixels = to_tensor(unmasked("capture", capture), color)
-    head = _light_head(system)
     light = pixels if linear else rgb_to_linear_rgb(pixels.expand(-1, 3, -1, -1))
+    if isinstance(system, PSFBank):
+        system = any_camera_system(system, sensor_of(light[0]))
+    head = _light_head(system)
     found = [reconstruct_light(head, one, memory_budget=memory_budget) for one in light]
     images = [one.image for one in found if one.image is not None]
     depths = [one.depth[0] for one in found if one.depth is not None]
@@ -255,9 +259,8 @@ def _light_head(system: Any) -> LightHead:
         system = saved_system(system) if file else from_pretrained(system)
     if isinstance(system, TiDyOptics):
         system = any_camera_system(system)
-    check_part(
-        "system", system, TrainedSystem, "a TiDyOptics, a TrainedSystem, a LightHead, a name, a file or a folder"
-    )
+    kinds = "a TiDyOptics, a PSFBank, a TrainedSystem, a LightHead, a name, a file or a folder"
+    check_part("system", system, TrainedSystem, kinds)
     return LightHead(system)
 
 

@@ -164,7 +164,7 @@ def reconstruct_light(
     light, _, notes = check_capture(light, _told_noise(head))
     colours = light.expand(3, -1, -1)[None]
     if head.field is not None:
-        return Reconstruction(_over_field(head, colours, *head.field)[0], None, notes)
+        return Reconstruction(_over_field(head, colours, *head.field, progress)[0], None, notes)
     with whole_picture(head, colours):
         cut = None
         if one_tile(head, colours, memory_budget) is None:
@@ -183,7 +183,13 @@ def reconstruct_light(
     return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation, notes)
 
 
-def _over_field(head: LightHead, light: Tensor, model: PSFModel, center: tuple[float, float]) -> Tensor:
+def _over_field(
+    head: LightHead,
+    light: Tensor,
+    model: PSFModel,
+    center: tuple[float, float],
+    progress: Callable[[int, int], object] | None,
+) -> Tensor:
     """Restore a capture through a real lens by a closed form, or the network for any camera, with the local PSFs."""
     own = shared_copy(head)
     form = next(part for part in own.modules() if isinstance(part, ClosedForm))
@@ -194,7 +200,8 @@ def _over_field(head: LightHead, light: Tensor, model: PSFModel, center: tuple[f
         return own(part)[0]
 
     with whole_picture(own, light):
-        return restored_over_field(light, model, restore, center=center, tile=FIELD_TILE).clamp(0, 1)
+        restored = restored_over_field(light, model, restore, center=center, tile=FIELD_TILE, progress=progress)
+    return restored.clamp(0, 1)
 
 
 def _told_noise(head: LightHead) -> MeasuredNoise | None:

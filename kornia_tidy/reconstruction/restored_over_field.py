@@ -22,6 +22,7 @@ def restored_over_field(
     center: tuple[float, float] = (0.0, 0.0),
     defocus: tuple[float, float] | None = None,
     tile: int = TILE,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Tensor:
     """Restore a capture through a real lens by a restoration that knows one PSF for each depth.
 
@@ -36,6 +37,7 @@ def restored_over_field(
         center: of the capture, y and x in sensor pixels from the lens's axis: ``optics.field_center``.
         defocus: lowest and highest of the scene in radians. Default: the camera's range.
         tile: side of the tiles in pixels, at least 2.
+        progress: called with the number of finished tiles and of all tiles, after each.
 
     Returns:
         (B, C, H, W).
@@ -65,6 +67,7 @@ def restored_over_field(
     bank, reach = model.scene_field_bank(capture.shape[1], dtype, ends, field), model.window - 1
     total = torch.zeros_like(capture, dtype=dtype)
     (rows, down), (columns, across) = (_places(side, tile) for side in size)
+    done, tiles = 0, len(rows) * len(columns)
     for top, weight in zip(rows, down, strict=True):
         for left, beside in zip(columns, across, strict=True):
             bottom, right = top + len(weight), left + len(beside)
@@ -73,6 +76,9 @@ def restored_over_field(
             psfs = bank.between(field, ((top + bottom - 1) / 2, (left + right - 1) / 2))
             own = restore(part, psfs)[..., top - y : bottom - y, left - x : right - x]
             total[..., top:bottom, left:right] += own * (weight[:, None] * beside).to(own)
+            done += 1
+            if progress is not None:
+                progress(done, tiles)
     return total.to(capture.dtype)
 
 

@@ -77,8 +77,8 @@ class RuledClosedForm(ClosedForm):
 
     .. math:: R(c) = \overline{|B(u) - u|^2} + 2 \, \overline{n \cdot \partial_n B(u)},
 
-    where n is noise drawn as the capture has it, restored and encoded as the capture is; its derivative is a difference.
-    So texture beyond the noise is kept, and behind sharp optics in bright light c is 0.
+    where n is noise drawn as the capture has it, restored and encoded as the capture is; the derivative is a
+    difference. So texture beyond the noise is kept, and behind sharp optics in bright light c is 0.
 
     The rule and its numbers were found on real scenes of half A behind the training cameras of
     ``tests/benchmarks/any_camera``. ``docs/record`` says how near it comes to the best choice behind each camera.
@@ -103,8 +103,8 @@ class RuledClosedForm(ClosedForm):
         - No gradient reaches the settings.
 
     Source: Wiener (1949); Tomasi and Manduchi, Bilateral Filtering (ICCV 1998); Stein, Estimation of the mean of a
-    multivariate normal distribution (Annals of Statistics 9(6), 1981); Ramani, Blu and Unser, Monte-Carlo SURE (IEEE
-    TIP 17(9), 2008).
+    multivariate normal distribution (Annals of Statistics 9(6), 1981); Ramani et al., Monte-Carlo SURE (IEEE TIP
+    17(9), 2008), for the derivative by a random difference.
 
     Example:
         >>> from kornia_tidy.psf.psf_bank import PSFBank

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 
-import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 

@@ -111,7 +111,10 @@ class TestReconstructLight(BaseTester):
         image = dead_leaves(96, 96, seed=1)[0]
         coded = optics(image, torch.full((1, 96, 96), 0.595), generator=torch.Generator().manual_seed(0))
         system = any_camera_system(optics, head=head)
-        restored = reconstruct_light(LightHead(system), optics.decode(coded)).image
+        seen = []
+        options = {"progress": lambda *counts: seen.append(counts)}
+        restored = reconstruct_light(LightHead(system), optics.decode(coded), **options).image
+        assert seen == [(1, 1)]
         lost = [
             float((x - image)[..., 16:-16, 16:-16].square().mean()) for x in (restored, system.head(coded[None])[0])
         ]

@@ -134,7 +134,8 @@ class TestRuledClosedForm(BaseTester):
         restore = ruled(points(), encoded=False)
         scene = 0.4 + 0.5 * painted(120, 1, seed=3).clamp(-0.7, 1).expand(-1, 3, -1, -1)
         scene = torch.where(scene.mean(1, keepdim=True) > 0.45, scene + 0.2, scene).clamp(0, 1)
-        light = scene + noise * torch.randn(scene.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        generator = torch.Generator().manual_seed(0)
+        light = scene + noise * torch.randn(scene.shape, dtype=torch.float64, generator=generator)
         found = restore.settings(light, torch.full_like(light, noise))
         unsmoothed = restore._restored(light, light, torch.full_like(light, noise), found.place, 0 * found.color).image
         errors = {0.0: float((unsmoothed - scene).square().mean())}

@@ -13,8 +13,8 @@ from tests.benchmarks.any_camera.cameras import POOLS
 from tests.benchmarks.any_camera.captures import photograph, photograph_collages
 from tests.benchmarks.any_camera.closed_form import sweep
 from tests.benchmarks.any_camera.guards import measure
-from tests.benchmarks.any_camera.scores import averaged, mixed, score_pool
-from tests.benchmarks.any_camera.training import ship, start, train
+from tests.benchmarks.any_camera.scores import averaged, first_weights, mixed, score_pool
+from tests.benchmarks.any_camera.training import ship, train
 
 
 def main() -> None:
@@ -24,7 +24,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of captures, checkpoints and scores; a step goes on where it ended")
     parser.add_argument("--pool", choices=tuple(POOLS), default="training")
     parser.add_argument("--photographs", type=Path, help="folder, for collages")
-    parser.add_argument("--share", type=float, default=0.0, help="of the start's weights in those that are shipped")
+    parser.add_argument("--share", type=float, default=0.0, help="of the first weights in those that are shipped")
     parser.add_argument("--steps", type=int, default=2400)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -40,7 +40,7 @@ def main() -> None:
     elif options.step == "guards":
         measure(options.folder)
     elif options.step == "ship":
-        ship(mixed(averaged(options.folder), start().network.state_dict(), options.share), WEIGHTS)
+        ship(mixed(averaged(options.folder), first_weights(options.folder), options.share), WEIGHTS)
     else:
         score_pool(options.folder, options.pool, closed_forms=options.step == "closed-forms")
 

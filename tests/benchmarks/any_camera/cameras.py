@@ -58,7 +58,7 @@ POOLS = {
 
 
 def pool_names(pool: str) -> list[str]:
-    """Return the names of the cameras of a pool; those of training begin with the shipped ones, and end with sharp ones."""
+    """Return the names of the cameras of a pool; of training: shipped ones, drawn ones, sharp ones."""
     drawn = [f"{pool}-{index:02d}" for index in range(POOLS[pool].count)]
     return [*SHIPPED, *drawn, *pool_names("sharp")] if pool == "training" else drawn
 

@@ -12,7 +12,7 @@ from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, largest_share
+from kornia_tidy.reconstruction.any_camera import AnyCameraHead, any_camera_head, corrected, largest_share
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.metrics import psnr
@@ -125,14 +125,18 @@ def _closed_forms(psfs: Tensor, light: Tensor, noise: float, truth: Tensor) -> l
 
 
 def networks_of(folder: Path, candidates: bool) -> dict[str, torch.nn.Module]:
-    """Return the network that is shipped, or candidates: the mean of the weights, alone and with those of the start."""
-    if not candidates:
-        from kornia_tidy.reconstruction.any_camera import any_camera_head
+    """Return the network that is shipped, and with candidates the mean of the weights, alone and with the first."""
+    networks: dict[str, torch.nn.Module] = {"any-camera": any_camera_head().network.eval()}
+    if candidates:
+        first, weights = first_weights(folder), averaged(folder)
+        networks |= {f"{share:g} of the first": _network(mixed(weights, first, share)) for share in (0.0, 0.35)}
+    return networks
 
-        return {"any-camera": any_camera_head().network.eval()}
-    first = start().network.state_dict()
-    weights = averaged(folder)
-    return {f"{share:g} of the start": _network(mixed(weights, first, share)) for share in (0.0, 0.2, 0.4)}
+
+def first_weights(folder: Path) -> dict[str, Tensor]:
+    """Return the weights from which training in a folder begins: its ``first.pt``, or those of a shipped network."""
+    stored = folder / "first.pt"
+    return torch.load(stored, weights_only=True) if stored.exists() else start().network.state_dict()
 
 
 def averaged(folder: Path) -> dict[str, Tensor]:
