@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 
+import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 
@@ -37,10 +38,10 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     parts = closed_forms_without_statistics(head)
     if parts:
         strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
-        total = sum((rgb_to_linear_rgb(strip) if encoded else strip).sum((-2, -1)) for strip in strips)
-        mean = total[..., None, None] / (picture.shape[-2] * picture.shape[-1])
-        parts_of_it = [part.clamp(0, 1) for part in sampled_windows(picture)]
-        sample = [rgb_to_linear_rgb(part) if encoded else part for part in parts_of_it]
+        sums = [(rgb_to_linear_rgb(strip) if encoded else strip).sum((-2, -1)) for strip in strips]
+        mean = torch.stack(sums).sum(0)[..., None, None] / (picture.shape[-2] * picture.shape[-1])
+        windows = [part.clamp(0, 1) for part in sampled_windows(picture)]
+        sample = [rgb_to_linear_rgb(part) if encoded else part for part in windows]
     try:
         for part in parts:
             part.mean_light, part.sample = mean.to(part.psfs), sample
