@@ -250,9 +250,7 @@ class ClosedForm(nn.Module):
             ValueError: if the noise does not broadcast to the capture.
         """
         if noise is None:
-            light = self._light(capture.clamp(0, 1))
-            dark, rise = self.noise_model.to(light.dtype)
-            return (dark + rise * light).sqrt()
+            return self._noise_of(self._light(capture.clamp(0, 1)))
         noise = noise.to(capture) if isinstance(noise, Tensor) else capture.new_tensor(noise)
         fits = all(side in {1, whole} for side, whole in zip(noise.shape, capture.shape, strict=False))
         if noise.ndim not in {0, 4} or not fits:
@@ -337,6 +335,11 @@ class ClosedForm(nn.Module):
     def _brightness(self, light: Tensor) -> Tensor:
         """Encode one map for each depth, (B, D, H, W)."""
         return self._encode(light.unsqueeze(2).expand(-1, -1, 3, -1, -1))[:, :, 0]
+
+    def _noise_of(self, light: Tensor) -> Tensor:
+        """Return the standard deviation of the sensor's noise at light within [0, 1]."""
+        dark, rise = self.noise_model.to(light.dtype)
+        return (dark + rise * light).sqrt()
 
     def _light(self, colors: Tensor) -> Tensor:
         return rgb_to_linear_rgb(colors) if self.encoded else colors

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
@@ -124,6 +124,7 @@ class RuledClosedForm(ClosedForm):
 
     def __init__(self, layers: int = 0, *, encoded: bool = True) -> None:
         super().__init__(layers, encoded=encoded, inverse="wiener")
+        self.remembered: dict[float | None, Settings] = {}  # of the sample, by the noise told; None: the sensor's
         places = STEPS * (len(NOISES) - 1) + 1
         for name, shape in (("norms", (places,)), ("scene_errors", (places,)), ("photographs_detail", ())):
             self.register_buffer(name, torch.ones(shape), persistent=False)
@@ -133,6 +134,7 @@ class RuledClosedForm(ClosedForm):
 
     def _set_kernels(self, psfs: Tensor) -> None:
         super()._set_kernels(psfs)
+        self.remembered = {}
         psfs = psfs.to(self.kernels.dtype)
         self.kernels = torch.cat([wiener_kernels(psfs, NOISES[:FINER]), self.kernels])
         psfs, kernels = psfs.detach(), self.kernels.detach()
@@ -183,6 +185,11 @@ class RuledClosedForm(ClosedForm):
         left = (noise.flatten()[:, None] * self.norms.to(noise)).square()
         return (left + self.scene_errors.to(noise)).min(1).values.sqrt()[:, None, None, None]
 
+    def set_noise(self, sensor: nn.Module) -> None:
+        """Take the noise of a sensor as the default for captures without a given noise, see :class:`ClosedForm`."""
+        super().set_noise(sensor)
+        self.remembered = {}
+
     @torch.no_grad()
     def settings(self, light: Tensor, noise: Tensor) -> Settings:
         """Return how captures are restored.
@@ -191,7 +198,19 @@ class RuledClosedForm(ClosedForm):
             light: (B, 3, H, W), linear, without stray light.
             noise: standard deviation in linear light, (B, 3, H, W).
         """
-        windows = self._windows(light, noise)
+        if self.sample is None:
+            return self._settings(list(zip(sampled_windows(light), sampled_windows(noise), strict=True)))
+        told = None if self._is_of_sensor(light, noise) else float(noise.square().nan_to_num().mean().sqrt())
+        if told not in self.remembered:
+            windows = [part.to(light) for part in self.sample]
+            levels = [self._noise_of(part) if told is None else torch.full_like(part, told) for part in windows]
+            without = [self._without_stray_light(part) for part in windows]
+            self.remembered[told] = self._settings(list(zip(without, levels, strict=True)))
+        return self.remembered[told]
+
+    def _settings(self, windows: list[tuple[Tensor, Tensor]]) -> Settings:
+        """Return the settings from windows of light and of its noise."""
+        light = windows[0][0]
         facts = zip(*(self._facts(*one) for one in windows), strict=True)
         detail, variance, slope = (torch.stack(each).mean(0) for each in facts)
         power = (detail - 2 * variance).clamp(min=LEAST_DETAIL * variance) / self.photographs_detail.to(light)
@@ -203,19 +222,10 @@ class RuledClosedForm(ClosedForm):
         even = torch.stack(squares).mean(0).sqrt().clamp(min=LEAST_NOISE)
         return Settings(even, place, self._color_of_least_risk(windows, place))
 
-    def _windows(self, light: Tensor, noise: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return windows of light without stray light, and of its noise: of the whole picture, if it is known."""
-        if self.sample is None:
-            return list(zip(sampled_windows(light), sampled_windows(noise), strict=True))
-        windows = [self._without_stray_light(part.to(light)) for part in self.sample]
-        dark, rise = self.noise_model.to(light)
-        by_sensor = [(dark + rise * part.to(light).clamp(0, 1)).sqrt() for part in self.sample]
-        even = noise.square().nan_to_num().mean((1, 2, 3), keepdim=True).sqrt()
-        # noise of the sensor differs from window to window, one that is told does not
+    def _is_of_sensor(self, light: Tensor, noise: Tensor) -> bool:
+        """Return whether the noise of a tile without stray light is that of the sensor, and no other that was told."""
         seen = light + self._stray_light(light) if self.has_stray_light else light
-        own = (dark + rise * seen.clamp(0, 1)).sqrt()
-        follows = ((own - noise).abs() <= 1e-3 * noise).flatten(1).float().mean(1)[:, None, None, None] > 0.5
-        return [(w, torch.where(follows, n, even)) for w, n in zip(windows, by_sensor, strict=True)]
+        return bool(((self._noise_of(seen.clamp(0, 1)) - noise).abs() <= 1e-3 * noise).float().mean() > 0.5)
 
     def _facts(self, light: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return detail and variance of noise of the encoded light, and the mean squared slope of the code, (B,)."""

@@ -10,7 +10,7 @@ from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.reconstruction.closed_form import ClosedForm
-from kornia_tidy.reconstruction.ruled_closed_form import sampled_windows
+from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm, sampled_windows
 
 
 @contextmanager
@@ -45,6 +45,8 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     try:
         for part in parts:
             part.mean_light, part.sample = mean.to(part.psfs), sample
+            if isinstance(part, RuledClosedForm):
+                part.remembered = {}
         yield
     finally:
         for part in parts:
