@@ -213,10 +213,7 @@ class ClosedForm(nn.Module):
     def _set_kernels(self, psfs: Tensor) -> None:
         """Compute the kernels from PSFs, (D, 3, P, P)."""
         wide = psfs.to(torch.promote_types(psfs.dtype, torch.float32))
-        if self.inverse == "wiener":
-            self.kernels = wiener_kernels(wide, WIENER_NOISES)
-        else:
-            self.kernels = tikhonov_kernels(wide.mean(0), WEIGHTS)
+        self.kernels = self._kernels_of(wide)
         if self.likelihood:
             self.filters = tikhonov_kernels(wide.flatten(0, 1), (BLEND_WEIGHT,)).unflatten(1, (-1, 3))[0]
         elif self.layers:
@@ -226,6 +223,11 @@ class ClosedForm(nn.Module):
             beyond = max(0, wide.shape[-1] - LIKELIHOOD_WINDOW) // 2
             middle = slice(beyond, wide.shape[-1] - beyond)
             self.whitening, self.log_determinants = likelihood_filters(wide.mean(1)[..., middle, middle])
+
+    def _kernels_of(self, psfs: Tensor) -> Tensor:
+        if self.inverse == "wiener":
+            return wiener_kernels(psfs, WIENER_NOISES)
+        return tikhonov_kernels(psfs.mean(0), WEIGHTS)
 
     def set_noise(self, sensor: nn.Module) -> None:
         """Take the noise of a sensor as the default for captures without a given noise.
@@ -293,8 +295,13 @@ class ClosedForm(nn.Module):
         place = self._place(noise.clamp(min=LEAST_NOISE).log10())
         return self._restored(capture, light, noise, place, self._color(noise))
 
+    def _chosen(self, light: Tensor, estimates: Tensor, place: Tensor) -> Tensor:
+        """Return the light restored by the kernel at a place."""
+        del light
+        return interpolated(estimates, place)
+
     def _restored(self, capture: Tensor, light: Tensor, noise: Tensor, place: Tensor, color: Tensor) -> Restoration:
-        """Restore light by the estimate at a place among those of the kernels, and smooth it by a width in colour."""
+        """Restore light by the kernel at a place, and smooth it by a width in colour."""
         estimates = convolve_kernels(light, self.kernels.to(light.dtype))
         level = noise.clamp(min=LEAST_NOISE).log10()
         brightness = light.mean(1, keepdim=True)
@@ -306,12 +313,11 @@ class ClosedForm(nn.Module):
             image = self._encode((shares.unsqueeze(2) * deconvolved).sum(1))
             by_depth = [self._brightness(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
         else:
-            image = self._encode(interpolated(estimates, place))
+            image = self._encode(self._chosen(light, estimates, place))
             if self.layers:
                 by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
         image = self._smooth(image, color)
-        told = estimates[:, -len(WEIGHTS) :]
-        maps = [capture, self._encode(told).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
+        maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
         return Restoration(image, torch.cat(maps, 1), deconvolved)
 
     def _place(self, level: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from kornia_tidy.reconstruction.closed_form import (
 )
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov import transfer_function
+from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 from kornia_tidy.render.borders import next_fast_size, pad_border
@@ -31,8 +32,10 @@ from kornia_tidy.render.borders import next_fast_size, pad_border
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
 CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
-FINER = 2  # kernels for less noise than those that a network is shown
+FINER = 2  # Wiener filters for less noise than those that a network is shown
 NOISES = tuple(WIENER_NOISES[0] * 10 ** (STEP * i) for i in range(-FINER, 0)) + WIENER_NOISES
+TIKHONOV = (3e-2, 1e-2, 3e-3, 1e-3)  # weights of the filters that follow, whose inverses of wide PSFs are cut less
+FILTERS = len(NOISES) + len(TIKHONOV)
 BEFORE_BILATERAL = 0.3  # of the variance of noise: how much the kernel takes it for, as a bilateral filter follows
 CONTENT = (0.03, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
 LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the scene
@@ -53,16 +56,17 @@ class Settings(NamedTuple):
     noise: Tensor
     """Standard deviation of even noise with the mean variance of the capture's, in linear light, (B, 1, 1, 1)."""
     place: Tensor
-    """Of the kernel among those of the closed form, (B, 1, 1, 1)."""
+    """Of the kernel between Wiener's by rising noise and Tikhonov's by falling weight, (B, 1, 1, 1)."""
     color: Tensor
     """Width of the bilateral filter in colour, (B, 1, 1, 1); 0 for none."""
 
 
 class RuledClosedForm(ClosedForm):
-    r"""Wiener filter and bilateral filter with settings that follow from the PSFs, the noise and the capture.
+    r"""Deconvolution and bilateral filter with settings that follow from the PSFs, the noise and the capture.
 
     The settings of :class:`~kornia_tidy.reconstruction.closed_form.ClosedForm` were chosen behind one camera. Here the
-    kernel k minimises the predicted error of the encoded picture:
+    kernel k, Wiener's for one of several noises, Tikhonov's of one of several weights, or a blend of two neighbours,
+    minimises the predicted error of the encoded picture:
 
     .. math:: J(k) = r \int S \, \big\langle |1 - K H|^2 \big\rangle \, df + 0.3 \, s^2 \lVert k \rVert_2^2
 
@@ -70,7 +74,7 @@ class RuledClosedForm(ClosedForm):
     spectrum of photographs, and r this scene's share of it: the power of differences between neighbouring pixels of
     the encoded capture, less that of noise, over the one that photographs would have behind this camera; between .03
     and 4 times :math:`\overline{g'^2}`. Noise counts by .3, as the bilateral filter takes noise away. Kernels are of
-    bounded size, so a PSF that fills its window is inverted less sharply.
+    bounded size, so a PSF that fills its window is inverted less sharply, and rather by Tikhonov's.
 
     The width c of the bilateral filter B in colour is the one of the least risk that Stein's estimate predicts for the
     picture u that the kernel restored,
@@ -121,29 +125,39 @@ class RuledClosedForm(ClosedForm):
     photographs_detail: Tensor
     bands: Tensor
     drawn: Tensor
+    places: Tensor
 
     def __init__(self, layers: int = 0, *, encoded: bool = True) -> None:
         super().__init__(layers, encoded=encoded, inverse="wiener")
         self.remembered: dict[float | None, Settings] = {}  # of the sample, by the noise told; None: the sensor's
-        places = STEPS * (len(NOISES) - 1) + 1
+        places = STEPS * (FILTERS - 1) + 1
         for name, shape in (("norms", (places,)), ("scene_errors", (places,)), ("photographs_detail", ())):
             self.register_buffer(name, torch.ones(shape), persistent=False)
         self.register_buffer("bands", torch.zeros(2, len(WIENER_NOISES), len(BANDS) + 1), persistent=False)
+        self.register_buffer("places", torch.zeros(0), persistent=False)
         drawn = torch.randn(3, SAMPLED, SAMPLED, generator=torch.Generator().manual_seed(0))
         self.register_buffer("drawn", drawn, persistent=False)
 
-    def _set_kernels(self, psfs: Tensor) -> None:
-        super()._set_kernels(psfs)
-        self.remembered = {}
-        psfs = psfs.to(self.kernels.dtype)
-        self.kernels = torch.cat([wiener_kernels(psfs, NOISES[:FINER]), self.kernels])
-        psfs, kernels = psfs.detach(), self.kernels.detach()
-        between = torch.stack([kernels[:-1], (kernels[:-1] + kernels[1:]) / 2], 1).flatten(0, 1)
-        halves = torch.cat([between, kernels[-1:]])
-        errors, self.photographs_detail = predicted_errors(psfs, halves)
+    def _kernels_of(self, psfs: Tensor) -> Tensor:
+        filters = torch.cat([wiener_kernels(psfs, NOISES), tikhonov_kernels(psfs.mean(0), TIKHONOV)])
+        known, self.places = psfs.detach(), filters.detach()
+        between = torch.stack([self.places[:-1], (self.places[:-1] + self.places[1:]) / 2], 1).flatten(0, 1)
+        halves = torch.cat([between, self.places[-1:]])
+        errors, self.photographs_detail = predicted_errors(known, halves)
         self.scene_errors = _parabolas(errors)
         self.norms = _parabolas(halves.square().sum((-2, -1)).mean(1)).sqrt()
-        self.bands = band_facts(psfs)
+        self.bands = band_facts(known)
+        self.remembered = {}
+        return filters[FINER : len(NOISES)]
+
+    def _chosen(self, light: Tensor, estimates: Tensor, place: Tensor) -> Tensor:
+        del estimates
+        kernels = self._kernels_at(place)
+        return torch.cat([convolve_kernels(*one)[:, 0] for one in zip(light.split(1), kernels.split(1), strict=True)])
+
+    def _kernels_at(self, place: Tensor) -> Tensor:
+        """Return the kernels at places (B, 1, 1, 1), (B, C, Q, Q)."""
+        return interpolated(self.places.to(place).expand(len(place), *self.places.shape), place)
 
     def settings_of(self, capture: Tensor, noise: Tensor | float | None = None) -> Settings:
         """Return the settings of a capture, in its dtype; for arguments see the class."""
@@ -246,7 +260,7 @@ class RuledClosedForm(ClosedForm):
 
     def _color_of_least_risk(self, windows: list[tuple[Tensor, Tensor]], place: Tensor) -> Tensor:
         """Return the width in colour with the least risk over all windows, (B, 1, 1, 1)."""
-        kernels = interpolated(self.kernels.detach().to(place).expand(len(place), -1, -1, -1, -1), place)
+        kernels = self._kernels_at(place)
         pairs = [self._perturbed(light, noise, kernels) for light, noise in windows]
         deviation = torch.stack([noise.square().mean((1, 2, 3)) for _, _, noise in pairs]).mean(0).sqrt()
         steps = deviation.new_tensor(COLORS)
@@ -264,9 +278,7 @@ class RuledClosedForm(ClosedForm):
         rows, columns = light.shape[-2:]
         light, noise = light.nan_to_num(), noise.nan_to_num()
         pair = torch.stack([light, light + PERTURBED * noise * self.drawn[:, :rows, :columns].to(light)], 1)
-        one, other = torch.stack(
-            [convolve_kernels(two, kernel[None])[:, 0] for two, kernel in zip(pair, kernels, strict=True)], 1
-        )
+        one, other = torch.stack([convolve_kernels(*one)[:, 0] for one in zip(pair, kernels.split(1), strict=True)], 1)
         first, second = self._encode(one), self._encode(other)
         return first, second, (second - first) / PERTURBED
 

@@ -17,7 +17,7 @@ from kornia_tidy.reconstruction.ruled_closed_form import (
     BEFORE_BILATERAL,
     CAMERA_MAPS,
     COLORS,
-    NOISES,
+    FILTERS,
     STEPS,
     band_facts,
     light_detail,
@@ -70,12 +70,12 @@ class TestRuledClosedForm(BaseTester):
         side = 5 + restore.kernels.shape[-1] + 1  # 28: the plane on which it is predicted, or one like it
         shares = PHOTOGRAPHS.depth_weights(torch.linspace(-1, 1, NODES, dtype=torch.float64))
         scenes = painted(side, 400)
-        found = torch.zeros(len(NOISES), dtype=torch.float64)
+        found = torch.zeros(FILTERS, dtype=torch.float64)
         for share, psf in zip(shares, psfs, strict=True):
             seen = circular(scenes, psf)
-            for index, kernel in enumerate(restore.kernels):
+            for index, kernel in enumerate(restore.places):
                 found[index] += share * (circular(seen, kernel) - scenes).square().mean()
-        told, _ = predicted_errors(psfs, restore.kernels)
+        told, _ = predicted_errors(psfs, restore.places)
         assert ((told / found).log().abs() < 0.1).all()
 
     def test_feature_photographs_have_the_detail_that_is_foretold(self):
@@ -88,7 +88,7 @@ class TestRuledClosedForm(BaseTester):
 
     def test_feature_errors_between_two_kernels_are_those_of_their_blend(self):
         restore = ruled()
-        blend = 0.25 * restore.kernels[2:3] + 0.75 * restore.kernels[3:4]
+        blend = 0.25 * restore.places[2:3] + 0.75 * restore.places[3:4]
         error, _ = predicted_errors(restore.psfs, blend)
         found = 2 * STEPS + 3 * STEPS // 4
         self.assert_close(restore.scene_errors[found], error[0])
@@ -98,20 +98,24 @@ class TestRuledClosedForm(BaseTester):
     def test_feature_the_kernel_is_the_one_of_least_error_on_simulated_pictures(self, noise):
         """Of blends of two kernels each, by simulated scene and the noise that counts: within 5 % of the best."""
         restore = ruled(encoded=False)
-        scenes = 0.4 + 0.5 * painted(96, 6, seed=1).clamp(-0.7, 1).expand(-1, 3, -1, -1)
-        psf = bank(NODES).psfs.mean(0)
-        seen = torch.cat([circular(scenes[:, c : c + 1], psf[c]) for c in range(3)], 1)
-        drawn = noise * torch.randn(seen.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        apart = convolve_kernels(seen, restore.kernels) - scenes[:, None]
-        left = convolve_kernels(drawn, restore.kernels)
+        scene = 0.4 + 0.5 * painted(96, 2, seed=1).clamp(-0.7, 1).expand(-1, 3, -1, -1)
+        shares = PHOTOGRAPHS.depth_weights(torch.linspace(-1, 1, NODES, dtype=torch.float64))
+        seen = torch.stack(
+            [torch.cat([circular(scene[:, c : c + 1], psf[c]) for c in range(3)], 1) for psf in bank(NODES).psfs]
+        )
+        drawn = noise * torch.randn(scene.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        apart = torch.stack([convolve_kernels(each, restore.places) - scene[:, None] for each in seen])
+        left = convolve_kernels(drawn, restore.places)
 
         def error(place):
-            low = min(int(place), len(NOISES) - 2)
-            one, other = ((1 - place + low) * part[:, low] + (place - low) * part[:, low + 1] for part in (apart, left))
-            return float(one.square().mean() + BEFORE_BILATERAL * other.square().mean())
+            low = min(int(place), FILTERS - 2)
+            rest = place - low
+            one = (1 - rest) * apart[:, :, low] + rest * apart[:, :, low + 1]
+            other = (1 - rest) * left[:, low] + rest * left[:, low + 1]
+            return float(shares @ one.square().mean((1, 2, 3, 4)) + BEFORE_BILATERAL * other.square().mean())
 
-        chosen = place(restore, seen + drawn, noise)
-        errors = [error(i / STEPS) for i in range((len(NOISES) - 1) * STEPS + 1)]
+        chosen = place(restore, (seen + drawn).flatten(0, 1), noise)
+        errors = [error(i / STEPS) for i in range((FILTERS - 1) * STEPS + 1)]
         assert error(float(chosen.mean())) < 1.05 * min(errors)
 
     def test_feature_a_cut_kernel_is_taken_less_sharp(self):

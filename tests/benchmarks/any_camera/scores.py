@@ -77,30 +77,29 @@ class Capturing:
 
 @torch.no_grad()
 def score_closed_forms(name: str, scenes: list[BenchScene]) -> Any:
-    """Return the PSNR of the rule, and of closed forms for every choice of settings, capture by capture."""
+    """Return the PSNR of closed forms for every choice of settings, capture by capture."""
     own, found = Capturing(name), []
     bank = closed_form_bank(own.optics)
     for scene, electrons, light, noise in own.captures(scenes):
-        rule = own.form(linear_rgb_to_rgb(light), noise).image
         even = light - _stray(own.form, light)
         level = float(noise.square().mean().sqrt())
         choices = _closed_forms(bank.psfs, even, level, scene.image)
         scores = {"capture": float(psnr(linear_rgb_to_rgb(light), scene.image)), "choices": choices}
-        scores["rule"] = float(psnr(rule, scene.image))
         found.append({"scene": scene.name, "electrons": electrons, **scores})
     return {"camera": in_words(own.optics), "scores": found}
 
 
 @torch.no_grad()
 def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, torch.nn.Module]) -> Any:
-    """Return the PSNR of networks capture by capture; behind a shipped camera also that of its own."""
+    """Return the PSNR of the rule and of networks capture by capture; behind a shipped camera also of its own."""
     own, found = Capturing(name), []
     head = load_pretrained(name).head if name in SHIPPED else None
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
         found = own.form.settings_of(capture, noise)
         restored, largest = own.form.restore_by(capture, found), largest_share(own.form, found.noise)
-        images = {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
+        images = {"rule": restored.image}
+        images |= {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:
             images["own"] = head(capture, noise=noise)
         scores = {key: float(psnr(image.clamp(0, 1), scene.image)) for key, image in images.items()}

@@ -51,7 +51,7 @@ SAVED_EVERY = 50  # steps
 
 
 OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
-MISTAKEN, MISTAKES = 0.35, 2  # share of draws with PSFs of a camera that is a little different; kinds of each camera
+MISTAKEN, MISTAKES = 0.35, 1  # share of draws with PSFs of a camera that is a little different; kinds of each camera
 LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors: of lengths; of the mask, in radii of the pupil; of focus, in radians
 DEMOSAICED = 0.2  # share of draws behind a Bayer filter
 GRAINY = 0.4  # share of draws whose scene has grain, which the optics blur and a network should keep
