@@ -96,8 +96,8 @@ def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, t
     head = load_pretrained(name).head if name in SHIPPED else None
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
-        found = own.form.settings_of(capture, noise)
-        restored, largest = own.form.restore_by(capture, found), largest_share(own.form, found.noise)
+        chosen = own.form.settings_of(capture, noise)
+        restored, largest = own.form.restore_by(capture, chosen), largest_share(own.form, chosen.noise)
         images = {"rule": restored.image}
         images |= {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:
