@@ -176,7 +176,7 @@ class TestReconstruct(BaseTester):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), "joint-9")
         with pytest.raises(ValueError, match=r"image must have shape .*, got \(8, 8, 4\): drop alpha"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 4), head)
-        with pytest.raises(TypeError, match="system must be a TiDyOptics, a TrainedSystem"):
+        with pytest.raises(TypeError, match="system must be a TiDyOptics, a PSFBank, a TrainedSystem"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), 5)
 
 
