@@ -10,7 +10,7 @@ from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
 from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches, split_frames
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
-from kornia_tidy.data.opencv_arrays import from_opencv, to_opencv
+from kornia_tidy.data.opencv_arrays import to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
 from kornia_tidy.data.photo_collages import PhotoCollages, photo_collage, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographic_leaves
@@ -45,7 +45,6 @@ __all__ = [
     "dead_leaves",
     "described_folder",
     "fill_holes",
-    "from_opencv",
     "hypersim",
     "kitti",
     "middlebury",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from fractions import Fraction
 from typing import Any
@@ -39,7 +39,7 @@ def with_exif(file: bytes, info: Mapping[str, Any]) -> bytes:
 
     Source: CIPA DC-008, Exif 2.32, section 4.6; PNG 1.2 extensions 1.5 (``eXIf``); JPEG's APP1; TIFF 6.0, section 2.
     """
-    picture, photo = _fields(info)
+    picture, photo = exif_fields(info)
     if not photo:
         return file
     if file.startswith(PNG):
@@ -62,7 +62,7 @@ def with_text(png: bytes, texts: Mapping[str, str]) -> bytes:
     return png
 
 
-def _fields(info: Mapping[str, Any]) -> tuple[list[Field], list[Field]]:
+def exif_fields(info: Mapping[str, Any]) -> tuple[list[Field], list[Field]]:
     """Return the fields of the picture's directory and of its EXIF directory; both are empty without metadata."""
 
     def known(name: str) -> Any:
@@ -98,9 +98,9 @@ def _rational(value: float) -> bytes:
 def _exif_block(picture: list[Field], photo: list[Field]) -> bytes:
     """Return a TIFF file without a picture: header, directory, EXIF directory."""
     pointer: Field = (EXIF_POINTER, LONG, 1, b"\0\0\0\0")
-    behind = 8 + len(_directory([*picture, pointer], 8))
-    first = _directory([*picture, (EXIF_POINTER, LONG, 1, struct.pack("<I", behind))], 8)
-    return TIFF + struct.pack("<I", 8) + first + _directory(photo, behind)
+    behind = 8 + len(directory([*picture, pointer], 8))
+    first = directory([*picture, (EXIF_POINTER, LONG, 1, struct.pack("<I", behind))], 8)
+    return TIFF + struct.pack("<I", 8) + first + directory(photo, behind)
 
 
 def _with_directories(file: bytes, picture: list[Field], photo: list[Field]) -> bytes:
@@ -114,13 +114,13 @@ def _with_directories(file: bytes, picture: list[Field], photo: list[Field]) -> 
         begin = entry + 8 if size <= 4 else struct.unpack_from("<I", file, entry + 8)[0]
         fields.append((tag, kind, number, file[begin : begin + size]))
     file += b"\0" * (len(file) % 2)
-    exif = _directory(photo, len(file))
+    exif = directory(photo, len(file))
     pointer: Field = (EXIF_POINTER, LONG, 1, struct.pack("<I", len(file)))
     place = len(file) + len(exif)
-    return file[:4] + struct.pack("<I", place) + file[8:] + exif + _directory([*fields, *picture, pointer], place)
+    return file[:4] + struct.pack("<I", place) + file[8:] + exif + directory([*fields, *picture, pointer], place)
 
 
-def _directory(fields: list[Field], place: int) -> bytes:
+def directory(fields: Sequence[Field], place: int) -> bytes:
     """Return the bytes of a directory at an offset of the file, followed by its values longer than four bytes."""
     behind = place + 2 + 12 * len(fields) + 4
     table, longer = struct.pack("<H", len(fields)), b""

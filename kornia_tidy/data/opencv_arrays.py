@@ -1,51 +1,16 @@
-"""Conversion between OpenCV's pictures, integer arrays (H, W, C) in BGR, and tensors."""
+"""Tensors to OpenCV's pictures, integer arrays (H, W, C) in BGR."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import DTypeLike, NDArray
 from torch import Tensor
 
-from kornia_tidy.checks import check_finite, check_float_tensor, unmasked
+from kornia_tidy.checks import check_finite, check_float_tensor
 
 _ROWS = 256  # converted at a time, so that the float64 copy stays small
-
-
-def from_opencv(picture: NDArray[Any]) -> Tensor:
-    """Convert an OpenCV picture to a tensor.
-
-    Args:
-        picture: (H, W), (H, W, 1), (H, W, 3) in BGR or (H, W, 4) with alpha, which is dropped; uint8 or uint16.
-
-    Returns:
-        (1, H, W), or (3, H, W) in RGB; float32 in [0, 1].
-
-    Raises:
-        TypeError: if it is not an array, or has another data type.
-        ValueError: if it is of another shape, or a masked array with masked values.
-
-    Example:
-        >>> from_opencv(np.array([[[0, 51, 255]]], np.uint8))
-        tensor([[[1.0000]],
-        <BLANKLINE>
-                [[0.2000]],
-        <BLANKLINE>
-                [[0.0000]]])
-    """
-    if not isinstance(picture, np.ndarray) or picture.dtype not in (np.uint8, np.uint16):
-        kind = picture.dtype if isinstance(picture, np.ndarray) else type(picture).__name__
-        raise TypeError(f"a picture of OpenCV's must be an array of uint8 or uint16, got {kind}")
-    picture = unmasked("picture", picture)
-    planes = picture[..., None] if picture.ndim == 2 else picture
-    if planes.ndim != 3 or planes.shape[2] not in {1, 3, 4} or 0 in planes.shape:
-        raise ValueError(f"a picture of OpenCV's must have shape (H, W), (H, W, 3) or (H, W, 4), got {picture.shape}")
-    planes = planes[..., 2::-1] if planes.shape[2] > 1 else planes
-    values = planes.transpose(2, 0, 1).astype(np.float32, order="C")
-    values /= np.iinfo(picture.dtype).max
-    return torch.from_numpy(values)
 
 
 def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
@@ -63,6 +28,7 @@ def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> NDArray[Any]:
         ValueError: if its shape or a value (NaN, infinity) is not as above.
 
     Example:
+        >>> import torch
         >>> to_opencv(torch.tensor([[[0.0, 0.5, 2.0]]]), np.uint16)
         array([[    0, 32768, 65535]], dtype=uint16)
     """

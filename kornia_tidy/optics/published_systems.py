@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.materials import PMMA, cauchy_through
@@ -142,6 +143,14 @@ _LIU_SOURCES = {
     "noise": "guess: 0.003, as Ikoma et al.",
     "start": "guess: noise of heights uniform on [0, 1.2e-6] m",
 }
+_LIU = partial(
+    System,
+    paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
+    camera=_ikoma_camera,
+    spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
+    compositing="occlusion",
+    sigma=0.003,
+)
 
 
 # ---------------------------------------------------------------------- the table
@@ -254,29 +263,22 @@ _ALL = (
             "start": "flat: the singlet as it is",
         },
     ),
-    System(
+    _LIU(
         name="liu2022-pixelwise",
         title="Liu et al., pixel-wise",
-        paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
         known_for="a free height in every pixel of the mask",
         mask="1 pixel-wise, 23 x 23, noise",
-        camera=_ikoma_camera,
         sources={
             **_LIU_SOURCES,
             "masks": "a pixel-wise height map: TiDy-PSFs, results",
             "size": "guess: 23 x 23 pixels",
         },
-        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
-        compositing="occlusion",
-        sigma=0.003,
     ),
-    System(
+    _LIU(
         name="liu2022-spiral",
         title="Liu et al., spiral",
-        paper="Liu et al.: Investigating deep optics model representation, Optics Express 30(20) 36973, 2022",
         known_for="rings of vortex phase: the PSF rotates with depth",
         mask="13 spiral rings",
-        camera=_ikoma_camera,
         sources={
             **_LIU_SOURCES,
             "masks": "orbital angular momentum: TiDy-PSFs, results",
@@ -284,9 +286,6 @@ _ALL = (
             "PSF rotates less than once",
             "start": "guess: charges 1 to 13",
         },
-        spectrum=Spectrum((632e-9, 550e-9, 450e-9), RGB.weights),
-        compositing="occlusion",
-        sigma=0.003,
     ),
     System(
         name="sitzmann2018",

@@ -12,7 +12,8 @@ from safetensors.torch import save_file
 import kornia_tidy
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
-from kornia_tidy.data import from_opencv, read_rgbd, to_opencv
+from kornia_tidy.camera.image_types import image_tensor
+from kornia_tidy.data import read_rgbd, to_opencv
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import load_pretrained
@@ -146,7 +147,7 @@ class TestReconstruct(BaseTester):
         assert image.shape == capture.shape
         assert depth.shape == (2, 32, 48)
         given = capture[1] if kind != "float32" else np.rint(65535 * capture[1]).astype(np.uint16)
-        light = rgb_to_linear_rgb(from_opencv(given))
+        light = rgb_to_linear_rgb(image_tensor(given[..., ::-1]))
         found, metres, *_ = reconstruct_light(head, light)
         expected, metres = to_opencv(found, given.dtype), metres[0].numpy()
         most = np.iinfo(given.dtype).max

@@ -11,6 +11,9 @@ from fractions import Fraction
 
 import numpy as np
 
+from kornia_tidy.data.metadata import EXIF_POINTER, directory
+from kornia_tidy.data.metadata import Field as ExifField
+
 Field = tuple[int, int, Sequence[float] | bytes]  # tag, type, values
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10  # types of TIFF 6.0
@@ -28,7 +31,7 @@ def dng_bytes(
     colors: str,
     white: int,
     fields: Sequence[Field] = (),
-    exif: Sequence[Field] = (),
+    exif: Sequence[ExifField] = (),
 ) -> bytes:
     """Encode samples and fields as the bytes of a DNG file.
 
@@ -72,33 +75,19 @@ def dng_bytes(
     return b"".join(_tiff(all_fields, exif, samples.data.cast("B")))
 
 
-def _tiff(fields: list[Field], exif: Sequence[Field], data: memoryview) -> tuple[bytes, memoryview]:
+def _tiff(fields: list[Field], exif: Sequence[ExifField], data: memoryview) -> tuple[bytes, memoryview]:
     """Encode a little-endian TIFF: header, directory, Exif directory, and the data of its one strip."""
     begin = 8
-    if exif:
-        fields = [*fields, (34665, LONG, [0])]
-    fields = [*fields, (273, LONG, [0])]
-    table = _directory(fields, begin)  # a first pass gives its size
-    nested = _directory(exif, begin + len(table)) if exif else b""
-    strip = -(-(begin + len(table) + len(nested)) // DATA_ALIGNMENT) * DATA_ALIGNMENT
-    places = {34665: begin + len(table), 273: strip}
-    fields = [(tag, kind, [places[tag]] if tag in places else values) for tag, kind, values in fields]
-    head = struct.pack("<2sHI", b"II", 42, begin) + _directory(fields, begin) + nested
+    fields = [*fields, (273, LONG, [0]), *([(EXIF_POINTER, LONG, [0])] if exif else [])]
+
+    def table(places: dict[int, list[int]]) -> bytes:
+        return directory([(tag, kind, *_packed(kind, places.get(tag, given))) for tag, kind, given in fields], begin)
+
+    behind = begin + len(table({}))  # a first pass gives its size
+    nested = directory(exif, behind) if exif else b""
+    strip = -(-(behind + len(nested)) // DATA_ALIGNMENT) * DATA_ALIGNMENT
+    head = struct.pack("<2sHI", b"II", 42, begin) + table({EXIF_POINTER: [behind], 273: [strip]}) + nested
     return head.ljust(strip, b"\0"), data
-
-
-def _directory(fields: Sequence[Field], begin: int) -> bytes:
-    """Encode a directory at an offset of the file, followed by the values longer than four bytes."""
-    entries, longer = b"", b""
-    outside = begin + 2 + 12 * len(fields) + 4
-    for tag, kind, values in sorted(fields, key=lambda field: field[0]):
-        count, content = _packed(kind, values)
-        if len(content) > 4:
-            place = struct.pack("<I", outside + len(longer))
-            longer += content + b"\0" * (len(content) % 2)
-            content = place
-        entries += struct.pack("<HHI", tag, kind, count) + content.ljust(4, b"\0")
-    return struct.pack("<H", len(fields)) + entries + struct.pack("<I", 0) + longer
 
 
 def _packed(kind: int, values: Sequence[float] | bytes) -> tuple[int, bytes]:

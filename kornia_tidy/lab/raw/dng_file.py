@@ -8,6 +8,7 @@ from datetime import datetime
 import numpy as np
 from torch import Tensor
 
+from kornia_tidy.data.metadata import exif_fields
 from kornia_tidy.files import write_bytes
 from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
 from kornia_tidy.lab.raw.color import srgb_from_xyz
@@ -63,7 +64,7 @@ def encode_dng(raw: RawCapture) -> bytes:
         *_camera(raw.info),
     ]
     colors = "".join(dict.fromkeys(raw.colors))
-    return dng_bytes(samples, raw.pattern_letters, colors, round(raw.white), fields, _exposure(raw.info))
+    return dng_bytes(samples, raw.pattern_letters, colors, round(raw.white), fields, exif_fields(vars(raw.info))[1])
 
 
 # ---------------------------------------------------------------------- fields
@@ -98,18 +99,6 @@ def _camera(info: RawInfo) -> list[Field]:
     fields: list[Field] = [(50708, ASCII, _text(info.camera or "kornia_tidy"))]
     fields += [(tag, ASCII, _text(text)) for tag, text in ((271, info.make), (272, info.model)) if text]
     return fields + ([(306, ASCII, _time(info.timestamp))] if info.timestamp else [])
-
-
-def _exposure(info: RawInfo) -> list[Field]:
-    """Return the fields of the Exif directory."""
-    numbers = ((33434, info.exposure), (33437, info.aperture))
-    fields: list[Field] = [(tag, RATIONAL, [value]) for tag, value in numbers if value]
-    if info.focal_length:
-        fields.append((37386, RATIONAL, [1e3 * info.focal_length]))  # millimetres
-    if info.iso:
-        fields.append((34855, SHORT, [min(round(info.iso), 65535)]))
-    fields += [(42036, ASCII, _text(info.lens))] if info.lens else []
-    return fields + ([(36867, ASCII, _time(info.timestamp))] if info.timestamp else [])
 
 
 def _text(text: str) -> bytes:
