@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import TYPE_CHECKING, NamedTuple
 
 from kornia.color import rgb_to_y
@@ -10,14 +11,13 @@ from kornia.filters import box_blur
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, TITLE, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, INK, LABEL, TITLE, require_matplotlib
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMN, MARGIN, GAP = 2.9, 0.3, 0.16  # inches
-ABOVE, BELOW = 0.26, 0.27  # inches; a heading above a picture, its words below
+COLUMN = 2.9  # inches
 ZOOM, DETAIL = 3, 1 / 8  # of the shorter side
 
 
@@ -57,23 +57,16 @@ def draw_comparison(rows: Sequence[Sequence[Panel | None]], title: str, subtitle
         raise ValueError("the first picture of a comparison must be the scene, and there is none")
     scene = rows[0][0].picture
     columns = max(map(len, rows))
-    side = COLUMN * scene.shape[-2] / scene.shape[-1]
-    foot = 0.24 * sum(note.count("\n") + 1 for note in notes) + 0.2
-    width = 2 * MARGIN + columns * COLUMN + (columns - 1) * GAP
-    height = 0.85 + len(rows) * (ABOVE + side + BELOW) + foot
-    figure = Figure(figsize=(width, height), facecolor="white")
-    left = MARGIN / width
-    figure.text(left, 1 - 0.38 / height, title, fontsize=14, weight="bold", color=INK)
-    figure.text(left, 1 - 0.62 / height, subtitle, fontsize=TITLE, color=FAINT)
+    tall = (COLUMN * scene.shape[-2] / scene.shape[-1] + 0.6) * len(rows) + 0.3 * len(notes) + 0.9
+    figure = Figure(figsize=(columns * (COLUMN + 0.2), tall), facecolor="white", layout="constrained")
+    figure.suptitle(f"{title}\n{subtitle}", fontsize=TITLE + 1.5, color=INK)
+    figure.supxlabel("\n".join(notes), fontsize=LABEL, color=INK, x=0.01, ha="left")
     place = detail_of(scene)
-    for y, row in enumerate(rows):
-        bottom = height - 0.85 - (y + 1) * (ABOVE + side + BELOW) + BELOW
-        for x, panel in enumerate(row):
+    for line, row in zip(figure.subplots(len(rows), columns, squeeze=False), rows, strict=True):
+        for axes, panel in zip_longest(line, row):
+            _bare(axes)
             if panel is not None:
-                corner = (MARGIN + x * (COLUMN + GAP)) / width, bottom / height
-                axes = figure.add_axes((*corner, COLUMN / width, side / height))
                 _draw(axes, panel, place)
-    figure.text(left, 0.12 / height, "\n".join(notes), fontsize=LABEL + 0.5, color=INK, va="bottom", linespacing=1.5)
     return figure
 
 
@@ -106,7 +99,6 @@ def _draw(axes: Axes, panel: Panel, place: tuple[int, int, int]) -> None:
 
     pixels = panel.picture.detach().cpu().clamp(0, 1).permute(1, 2, 0).numpy()
     axes.imshow(pixels, interpolation="antialiased")
-    _bare(axes)
     axes.set_xlabel(panel.words, fontsize=LABEL + 1, color=INK, labelpad=3)
     axes.set_title(panel.heading, fontsize=TITLE, color=ACCENT, weight="bold", loc="left", pad=4)
     if not panel.zoomed:

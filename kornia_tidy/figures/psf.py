@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
 
 from kornia_tidy.figures.psf_measures import PSFMeasures
 from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, open_chart, require_matplotlib
@@ -10,10 +12,10 @@ from kornia_tidy.figures.system_statistics import ring_centres
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
 HEADLINE, LABEL, SMALL = 13, 8.5, 7.5  # pt
-CELL, MARGIN, PLOTS = 1.25, 0.75, 3.0  # inches
+CELL, PLOTS = 1.25, 3.0  # inches
 
 
 def draw_psfs(measured: PSFMeasures, title: str) -> Figure:
@@ -37,43 +39,37 @@ def draw_psfs(measured: PSFMeasures, title: str) -> Figure:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     columns, rows = measured.psfs.shape[:2]
-    width, height = max(8.5, CELL * columns + 2 * MARGIN + 0.5), CELL * rows + PLOTS + 1.65
-    figure = Figure(figsize=(width, height), facecolor="white")
-    figure.text(0.25 / width, 1 - 0.35 / height, title, fontsize=HEADLINE, color=INK, weight="bold")
-    _montage(figure, measured)
-    bottom, tall = 0.6 / height, (PLOTS - 0.4) / height
-    _slice(figure.add_axes((MARGIN / width, bottom, 0.36, tall)), measured)
-    _transfer(figure.add_axes((0.58, bottom, 0.38, tall)), measured)
+    tall = CELL * rows + 0.6
+    size = max(8.5, CELL * columns + 2), tall + PLOTS + 0.4
+    figure = Figure(figsize=size, facecolor="white", layout="constrained")
+    figure.suptitle(title, fontsize=HEADLINE, color=INK, weight="bold")
+    above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))
+    _montage(above, measured)
+    left, right = below.subplots(1, 2)
+    _slice(left, measured)
+    _transfer(right, measured)
     return figure
 
 
-def _montage(figure: Figure, measured: PSFMeasures) -> None:
+def _montage(figure: SubFigure, measured: PSFMeasures) -> None:
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.colors import PowerNorm  # noqa: PLC0415
 
     (columns, rows), side = measured.psfs.shape[:2], measured.psfs.shape[-1]
-    width, height, head = figure.get_figwidth(), figure.get_figheight(), 0.85
-    left, right, top, bottom = MARGIN / width, 1 - 1 / width, 1 - head / height, 1 - (head + CELL * rows) / height
-    grid = figure.add_gridspec(rows, columns, left=left, right=right, top=top, bottom=bottom, wspace=0.05, hspace=0.05)
-    cells, scale = [], PowerNorm(0.5, 0, 1)
-    for row in range(rows):
-        for column in range(columns):
-            axes = figure.add_subplot(grid[row, column])
-            light = measured.psfs[column, row].clamp(min=0)
-            axes.imshow((light / light.amax()).numpy(), cmap=DEPTH_COLORS, norm=scale)
-            axes.set(xticks=[], yticks=[])
-            if row == 0:
-                axes.set_title(
-                    f"{measured.depths[column]}\n{_psi(measured.defocus[column])}", fontsize=LABEL, color=INK
-                )
-            if column == 0:
-                axes.set_ylabel(measured.channels[row], fontsize=LABEL, color=INK)
-            cells.append(axes)
+    cells, scale = figure.subplots(rows, columns, squeeze=False), PowerNorm(0.5, 0, 1)
+    for (row, column), axes in np.ndenumerate(cells):
+        light = measured.psfs[column, row].clamp(min=0)
+        axes.imshow((light / light.amax()).numpy(), cmap=DEPTH_COLORS, norm=scale)
+        axes.set(xticks=[], yticks=[])
+        if row == 0:
+            axes.set_title(f"{measured.depths[column]}\n{_psi(measured.defocus[column])}", fontsize=LABEL, color=INK)
+        if column == 0:
+            axes.set_ylabel(measured.channels[row], fontsize=LABEL, color=INK)
     length = max(1, round(side / 5))
-    cells[0].plot([0.06 * side, 0.06 * side + length], [0.92 * side] * 2, color="white", linewidth=2)
-    cells[0].text(0.06 * side, 0.86 * side, f"{length} px", color="white", fontsize=SMALL)
+    cells[0, 0].plot([0.06 * side, 0.06 * side + length], [0.92 * side] * 2, color="white", linewidth=2)
+    cells[0, 0].text(0.06 * side, 0.86 * side, f"{length} px", color="white", fontsize=SMALL)
     mapped = ScalarMappable(scale, DEPTH_COLORS)
-    bar = figure.colorbar(mapped, ax=cells, fraction=0.025, pad=0.012, ticks=[0, 0.1, 0.25, 0.5, 1])
+    bar = figure.colorbar(mapped, ax=cells, fraction=0.025, ticks=[0, 0.1, 0.25, 0.5, 1])
     bar.set_label("light, brightest pixel = 1", fontsize=SMALL, color=INK)
     bar.ax.tick_params(labelsize=SMALL)
 

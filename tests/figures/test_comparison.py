@@ -20,9 +20,9 @@ class TestDrawComparison(BaseTester):
             [None, Panel("d", SCENE, "", False)],
         ]
         figure = draw_comparison(rows, "title", "subtitle", ["a note", "another"])
-        assert [axes.get_title(loc="left") for axes in figure.axes] == ["scene", "capture", "d"]
-        assert [axes.get_xlabel() for axes in figure.axes] == ["sharp", "20 dB", ""]
-        assert [len(axes.child_axes) for axes in figure.axes] == [1, 1, 0]
+        assert [axes.get_title(loc="left") for axes in figure.axes] == ["scene", "capture", "", "d"]
+        assert [axes.get_xlabel() for axes in figure.axes] == ["sharp", "20 dB", "", ""]
+        assert [len(axes.child_axes) for axes in figure.axes] == [1, 1, 0, 0]
         top, left, side = detail_of(SCENE)
         shown = torch.from_numpy(figure.axes[1].child_axes[0].images[0].get_array()).permute(2, 0, 1)
         self.assert_close(shown.float(), blurred[:, top : top + side, left : left + side])
@@ -30,7 +30,7 @@ class TestDrawComparison(BaseTester):
             figure.axes[0].get_position().width * ZOOM * side / 96, rel=0.01
         )
         texts = [text.get_text() for text in figure.texts]
-        assert texts == ["title", "subtitle", "a note\nanother"]
+        assert texts == ["title\nsubtitle", "a note\nanother"]
 
     def test_feature_the_detail_is_where_the_scene_is_finest(self):
         top, left, side = detail_of(SCENE)
