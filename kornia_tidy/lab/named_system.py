@@ -25,7 +25,7 @@ def head_file(head: str) -> Path:
     if head in PRETRAINED:
         return FOLDER / f"{head}.safetensors"
     if head in CLOSED_FORMS:
-        raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs")
+        raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs, or its masks to raw reconstruct")
     if head in REPLACED:
         check_shipped(head)
     if not Path(head).exists():
@@ -53,7 +53,9 @@ def load_system(
             system's lens and depths.
     """
     if head is None and psfs is None and optics is None:
-        raise ValueError(f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, a saved camera, or --psfs")
+        raise ValueError(
+            f"a system is needed: one of {', '.join(PRETRAINED)}, a checkpoint, a saved camera, --psfs or --masks"
+        )
     if optics is not None:
         return any_camera_system(optics, sensor, head or ANY_CAMERA)
     measured = None if psfs is None else MeasuredPSFs.load(psfs)

@@ -313,7 +313,8 @@ def check_scene(
         raise ValueError(f"nodes must have shape {(depth,)}, one defocus a PSF layer, got {tuple(nodes.shape)}")
     if stray_light is not None and tuple(stray_light.shape) != (depth, channels):
         raise ValueError(
-            f"veil must have shape {(depth, channels)}, one value a layer and channel, got {tuple(stray_light.shape)}"
+            f"stray light must have shape {(depth, channels)}, one value a layer and channel, "
+            f"got {tuple(stray_light.shape)}"
         )
     if border not in BORDERS or min(height, width) < psf_width:  # no border needs more
         check_border(border, height, width, psf_width)

@@ -225,7 +225,7 @@ class TestRender(BaseTester):
             ({"psfs": (4, 3, 4, 4)}, "psfs must be square with an odd side, which has a centre, got 4x4"),
             ({"psfs": (4, 3, 5, 3)}, "psfs must be square with an odd side, which has a centre, got 5x3"),
             ({"nodes": (3,)}, "nodes must have shape (4,), one defocus a PSF layer, got (3,)"),
-            ({"veil": (4,)}, "veil must have shape (4, 3), one value a layer and channel, got (4,)"),
+            ({"veil": (4,)}, "stray light must have shape (4, 3), one value a layer and channel, got (4,)"),
         ],
     )
     @pytest.mark.parametrize("function", COMPOSITING.values(), ids=COMPOSITING)
