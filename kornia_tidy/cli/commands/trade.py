@@ -60,8 +60,8 @@ class Trade:
         *("depth_scale", "masks", "depth_range", "f_number", "focus_distance", "fit_depth"),
     )
     notes: ClassVar = """\
-Results are written to FOLDER/trade.json and trade.csv after every point, and at the end a
-figure to trade.png and a table to the screen.
+Results are written to FOLDER/trade.json after every point, and at the end a figure to
+trade.png and a table to the screen.
 
 No setting can lower the error below that of the other settings. With an exact but slow
 base, --base reference, the error of each single setting is measured.
@@ -129,8 +129,7 @@ environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much f
         print(f"\n{markdown(rows)}\n")
         tell("bold", "no other setting is both faster and closer to the reference")
         tell("wrote", f"{folder / 'trade.png'}: look at this one")
-        for other in ("trade.json", "trade.csv"):
-            tell("", str(folder / other))
+        tell("", str(folder / "trade.json"))
 
     def _scene(self) -> Scene:
         import torch

@@ -1,9 +1,7 @@
-"""Files of a sweep: JSON with its conditions, CSV for spreadsheets, and a table in Markdown."""
+"""Files of a sweep: JSON with its conditions, and a table in Markdown."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Sequence
@@ -15,7 +13,6 @@ from kornia_tidy.design.tradeoff.measure import TradeRow, pareto
 from kornia_tidy.files import write_bytes
 
 FORMAT = "kornia_tidy.trade/1"
-_KNOB = "fidelity."  # prefix of the CSV columns with the settings of the fidelity
 
 
 @dataclass(frozen=True)
@@ -27,21 +24,13 @@ class TradeRun:
 
 
 def write_trade(folder: str | os.PathLike[str], run: TradeRun) -> None:
-    """Write a run as ``trade.json`` and ``trade.csv``, atomically; None becomes an empty cell.
+    """Write a run as ``trade.json``, atomically.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
     """
-    rows = [asdict(row) for row in run.rows]
-    document = {"format": FORMAT, "conditions": asdict(run.conditions), "rows": rows}
+    document = {"format": FORMAT, **asdict(run)}
     write_bytes(Path(folder) / "trade.json", (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
-    cells = [{**row, **{_KNOB + name: value for name, value in row["fidelity"].items()}} for row in rows]
-    text = io.StringIO()
-    names = [name for name in cells[0] if name != "fidelity"] if cells else []
-    writer = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(cells)
-    write_bytes(Path(folder) / "trade.csv", text.getvalue().encode())
 
 
 def markdown(rows: Sequence[TradeRow]) -> str:

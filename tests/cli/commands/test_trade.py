@@ -44,7 +44,7 @@ class TestTrade(BaseTester):
         assert all(row["training_seconds"] > 0 for row in run["rows"])
         assert told.count("| layers | ") == len(LAYERS) + 1  # and the column of that name
         assert read_image(folder / "trade.png").shape == (3, 930, 1500)
-        assert {p.name for p in folder.iterdir()} == {"trade.json", "trade.csv", "trade.png"}
+        assert {p.name for p in folder.iterdir()} == {"trade.json", "trade.png"}
         assert all(str(path) in told for path in folder.iterdir())
 
     @pytest.mark.filterwarnings("default")

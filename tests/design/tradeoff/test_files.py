@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import asdict, replace
 
 import pytest
 
-from kornia_tidy import Fidelity
 from kornia_tidy.design.tradeoff import TradeRun, markdown, write_trade
 from tests.base import BaseTester
 from tests.design.tradeoff.samples import CONDITIONS, ROW, whole_sweep
@@ -19,14 +17,6 @@ class TestWriteTrade(BaseTester):
         document = json.loads((tmp_path / "trade.json").read_text())
         assert document["conditions"] == asdict(CONDITIONS)
         assert document["rows"] == [json.loads(json.dumps(asdict(row))) for row in run.rows]
-
-    def test_feature_csv_has_a_line_for_each_row_and_empty_cells_for_none(self, tmp_path):
-        odd = replace(ROW, fidelity=Fidelity('odd, "very"\nodd'))
-        write_trade(tmp_path, TradeRun(CONDITIONS, (ROW, odd)))
-        first, second = csv.DictReader((tmp_path / "trade.csv").read_text().splitlines(keepends=True))
-        assert (float(first["rmse"]), first["training_seconds"], first["fidelity.window"]) == (ROW.rmse, "", "")
-        assert (first["fidelity.layers"], second["fidelity.name"]) == (ROW.fidelity.layers, 'odd, "very"\nodd')
-        assert first.keys() == {*asdict(ROW), *(f"fidelity.{name}" for name in asdict(ROW.fidelity))} - {"fidelity"}
 
     def test_exception_the_folder_is_missing(self, tmp_path):
         with pytest.raises(FileNotFoundError):
