@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -17,38 +15,13 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.energies import energy_matrices, intensity_energies, pixel_energies
 from kornia_tidy.psf.propagation import sensor_kernels
 from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_cache import MEMORY
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, gapped_pupil_field, pupil_field
 
 Geometry = tuple[int, int, float, float, float]  # window, cells, cell pitch, extent, tolerance
 Gaps = tuple[int, float] | None  # cells along a side of a mask pixel and its fill factor, where that is not 1
 _STEPS = (1e-15, 1e-4)  # m; the PSF of one pixel of the largest takes a tenth of a second
-_MOST_BYTES = 256 * 2**20
-
-
-class _Memory:
-    """Tensors of each depth, by all that they depend on: of those used last so many bytes. Any thread may ask."""
-
-    def __init__(self) -> None:
-        self.held: OrderedDict[Hashable, tuple[Tensor, ...]] = OrderedDict()
-
-    def recall(self, keys: Sequence[Hashable], make: Callable[[list[int]], tuple[Tensor, ...]]) -> list[Tensor]:
-        """Return the tensors of all keys, stacked; ``make`` gives those of missing keys, by their places."""
-        known = [self.held.pop(key, None) for key in keys]
-        if missing := [place for place, own in enumerate(known) if own is None]:
-            with torch.inference_mode(False), torch.no_grad():
-                made = zip(*(tensor.unbind() for tensor in make(missing)), strict=True)
-            for place, own in zip(missing, made, strict=True):
-                known[place] = own
-        found = cast("list[tuple[Tensor, ...]]", known)
-        self.held.update(zip(keys, found, strict=True))
-        one = sum(tensor.nbytes for tensor in found[-1])
-        while len(self.held) * one > _MOST_BYTES and len(self.held) > len(keys):
-            self.held.popitem(last=False)
-        return [torch.stack(tensors) for tensors in zip(*found, strict=True)]
-
-
-_kernel_memory = _Memory()
-_matrix_memory = _Memory()  # of accelerators
+_MOST_BYTES = 256 << 20  # of matrices on an accelerator
 
 
 def exact_psf_bank(
@@ -125,12 +98,11 @@ def exact_psf_bank(
         if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _MOST_BYTES:
             constants = spectrum.wavelengths, tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device
 
-            def matrices_of(places: list[int]) -> tuple[Tensor, ...]:  # made on the CPU
-                at, waves = [defocus[place] for place in places], range(len(spectrum.wavelengths))
-                made = energy_matrices([kernels_of(at, w, torch.device("cpu")) for w in waves])
+            def matrices_of(nodes: tuple[float, ...]) -> tuple[Tensor, ...]:  # made on the CPU
+                made = energy_matrices([kernels_of(nodes, w, torch.device("cpu")) for w in range(len(shifts))])
                 return tuple(matrix.to(phase.device) for matrix in made)
 
-            left, pixels = _matrix_memory.recall([(psi, constants) for psi in defocus], matrices_of)
+            left, pixels = MEMORY.recall(constants, tuple(defocus), matrices_of)
             lens = pupil, tuple(dispersion), per_channel
             make = _constants_of.__wrapped__ if pupil.amplitude.requires_grad else _constants_of
             scales, amplitude, share = make(*lens, phase.device, phase.dtype)
@@ -202,9 +174,9 @@ def _kernels(
         return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
     if torch_mode() & Mode.TRACED or not remember:
         return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
-    keys = [(psi, step, geometry, gaps, device, dtype, torch.get_num_threads()) for psi in defocus]
+    parts = step, geometry, gaps, device, dtype, torch.get_num_threads()
 
-    def kernels_of(places: list[int]) -> tuple[Tensor]:
-        return (sensor_kernels([defocus[place] for place in places], step, *geometry, device, spans).to(dtype),)
+    def make(nodes: tuple[float, ...]) -> tuple[Tensor]:
+        return (sensor_kernels(nodes, step, *geometry, device, spans).to(dtype),)
 
-    return _kernel_memory.recall(keys, kernels_of)[0]
+    return MEMORY.recall(parts, defocus, make)[0]

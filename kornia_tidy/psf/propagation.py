@@ -51,8 +51,14 @@ def cell_integrals(
         [0.5, 0.5, 0.5, 0.5]
     """
     edge = num_cells * pitch / 2
-    slope = 2 * max(abs(psi) for psi in defocus) * edge + 2 * math.pi * highest  # of the phase, radians a pupil radius
-    points, weights = gauss_legendre(gauss_legendre_order(slope * pitch / 2, CELL_TOLERANCE), frequency.device)
+    slopes = [2 * abs(psi) * edge + 2 * math.pi * highest for psi in defocus]  # of the phase, radians a pupil radius
+    orders = [gauss_legendre_order(slope * pitch / 2, CELL_TOLERANCE) for slope in slopes]
+    if len(set(orders)) > 1:  # each depth by its own points, whatever others are asked for
+        alike = {order: [psi for psi, own in zip(defocus, orders, strict=True) if own == order] for order in orders}
+        rest = frequency, highest, num_cells, pitch, cells, moment
+        found = {order: iter(cell_integrals(nodes, *rest)) for order, nodes in alike.items()}
+        return torch.stack([next(found[order]) for order in orders])
+    points, weights = gauss_legendre(orders[0], frequency.device)
     if cells is None:
         centres = torch.arange(num_cells, dtype=torch.float64, device=frequency.device) - (num_cells - 1) / 2
         widths = torch.ones_like(centres)

@@ -1,99 +1,128 @@
-"""Which PSFs a scene needs, and a cache of them: while masks and camera do not change, each is computed once."""
+"""Which PSFs a scene needs, and the memory of them: for the same masks and lens, each depth is computed once."""
 
 from __future__ import annotations
 
+import weakref
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
 from kornia_tidy.mode import Mode, torch_mode
-from kornia_tidy.psf.psf_bank import PSFBank
 
-KINDS = 4  # banks remembered side by side: of RGB and of grey images, in float32 and in float64
 _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among them, which are no plain attributes
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class _Remembered:
-    """PSFs of one kind of bank, by their defocus, for one setting of masks and camera."""
+    """Tensors of some depths, and what was made of those that were asked for last."""
 
-    setting: Sequence[object]
-    states: Tensor
-    weights: Tensor
-    psfs: dict[float, Tensor] = field(default_factory=dict)
-    last: tuple[Hashable, PSFBank] | None = None  # the bank asked for last, ready to be rendered through
+    defocus: tuple[float, ...]
+    tensors: tuple[Tensor, ...]
+    asked: tuple[float, ...]
+    formed: Any
+    nbytes: int
 
 
-class BankMemory:
-    """Remembers PSFs by their defocus: of each kind of bank those for one setting of masks and camera at a time.
+class PSFMemory:
+    """Tensors of each depth, such as PSFs, by all that they depend on: of those used last so many bytes.
 
-    The masks are compared by value, so a PSF that no longer holds is never given out, however they were changed.
-    For use without gradients. Any number of threads may use it at once; those that meet on their first capture may each
-    compute the same PSF.
+    Parts are compared by value, so tensors that no longer hold are never given out, however masks and lens were
+    changed. Any number of threads may ask at once; those that meet on their first capture may each compute the same.
+
+    Args:
+        most_bytes: of all tensors together. What is larger is computed anew each time.
 
     Example:
         >>> asked = []
-        >>> def build(nodes):
+        >>> def make(nodes):
         ...     asked.append(nodes)
-        ...     return PSFBank(torch.ones(len(nodes), 1, 1, 1), torch.tensor(nodes), torch.ones(len(nodes), 1))
-        >>> memory, masks, weights = BankMemory(), torch.zeros(1, 4, 4), torch.ones(1)
+        ...     return (torch.tensor(nodes),)
+        >>> memory, masks = PSFMemory(), torch.zeros(1, 4, 4)
         >>> for nodes in ((0.0, 1.0), (1.0, 2.0), (0.0, 2.0)):
-        ...     bank = memory.recall("grey", (), masks, weights, nodes, build)
+        ...     (psfs,) = memory.recall(["grey", masks], nodes, make)
         >>> asked
         [(0.0, 1.0), (2.0,)]
     """
 
-    def __init__(self) -> None:
-        self._banks: dict[Hashable, _Remembered] = {}  # the one used last stands last
+    def __init__(self, most_bytes: int = 256 << 20) -> None:
+        self.most_bytes = most_bytes
+        self._held: dict[Hashable, _Remembered] = {}  # what was used last stands last
 
     def recall(
         self,
-        kind: Hashable,
-        setting: Sequence[object],
-        states: Tensor,
-        weights: Tensor,
+        parts: Sequence[object],
         defocus: tuple[float, ...],
-        build: Callable[[tuple[float, ...]], PSFBank],
-        stray_light: tuple[str, int] | None = None,
-    ) -> PSFBank:
-        """Return the bank for these nodes; only PSFs that are not remembered are computed.
+        make: Callable[[tuple[float, ...]], tuple[Tensor, ...]],
+        form: Callable[..., Any] = lambda *tensors: tensors,
+    ) -> Any:
+        """Return tensors for these depths; only those of depths that are not remembered are computed.
+
+        They may be given out again, so they must not be changed.
 
         Args:
-            kind: of bank, such as its spectrum. Banks of another kind, data type or device are remembered beside it.
-            setting: whatever else the PSFs depend on, compared by equality.
-            states: phases shown, (S, N, N).
-            weights: share of the exposure of each, (S,).
-            defocus: nodes in radians.
-            build: makes a bank of these states, before anything is done about stray light, for some nodes.
-            stray_light: arguments of :meth:`PSFBank.with_stray_light`; the last bank is then kept whole and given out
-                again, so its tensors must not be changed. Default: light outside the window is not treated.
+            parts: all that they depend on besides depth. Tensors are compared by value; of a module it must be the same
+                one with the same types and plain attributes, in it and its submodules.
+            defocus: depths in radians, ascending.
+            make: computes the tensors of some depths, each with an axis of depths first.
+            form: what to return, made of the tensors. Default: a tuple.
         """
-        with torch.inference_mode(False), torch.no_grad():  # remembered PSFs serve in training too
-            kind = (kind, states.dtype, states.device)
-            known = self._banks.get(kind)
-            if (
-                known is None
-                or known.setting != setting
-                or not (torch.equal(known.states, states) and torch.equal(known.weights, weights))
-            ):
-                known = _Remembered(setting, states.clone(), weights.clone())
-            others = [(other, bank) for other, bank in self._banks.items() if other != kind]
-            self._banks = {**dict(others[1 - KINDS :]), kind: known}
-            if stray_light is not None and (last := known.last) is not None and last[0] == (defocus, stray_light):
-                return last[1]
-            missing = tuple(psi for psi in defocus if psi not in known.psfs)
-            if missing:
-                known.psfs.update(zip(missing, build(missing).psfs, strict=True))
-            psfs = torch.stack([known.psfs[psi] for psi in defocus])
-            bank = PSFBank(psfs, psfs.new_tensor(defocus), psfs.sum((2, 3)))
-            if stray_light is not None:
-                bank = bank.with_stray_light(*stray_light)
-                known.last = (defocus, stray_light), bank
-            return bank
+        with torch.inference_mode(False), torch.no_grad():  # what is remembered serves in training too
+            key = tuple(_values(parts))
+            known = self._held.pop(key, None)
+            if known is None or known.asked != defocus:
+                known = _with_depths(known, defocus, make, form)
+                held = known.nbytes + sum(own.nbytes for own in list(self._held.values()))
+                for oldest in list(self._held):
+                    if held > self.most_bytes and (own := self._held.pop(oldest, None)) is not None:
+                        held -= own.nbytes
+            if known.nbytes <= self.most_bytes:
+                self._held[key] = known
+            return known.formed
+
+
+MEMORY = PSFMemory()
+"""The memory of all cameras of the process."""
+
+
+def _values(parts: Sequence[object]) -> Iterator[Hashable]:
+    for part in parts:
+        if isinstance(part, Tensor):
+            yield part.dtype, part.device, tuple(part.shape), part.detach().cpu().numpy().tobytes()
+        elif isinstance(part, nn.Module):
+            yield weakref.ref(part)
+            for module in part.modules():
+                yield type(module)
+                for name, value in vars(module).items():
+                    if name not in _OF_EVERY_MODULE:
+                        plain = value.tolist() if hasattr(value, "tolist") else value
+                        yield name
+                        yield repr(plain) if isinstance(plain, (list, dict, set)) else plain
+        else:
+            yield cast("Hashable", part)
+
+
+def _with_depths(
+    known: _Remembered | None,
+    defocus: tuple[float, ...],
+    make: Callable[[tuple[float, ...]], tuple[Tensor, ...]],
+    form: Callable[..., Any],
+) -> _Remembered:
+    """Return what is known, with tensors of these depths too."""
+    nodes, tensors = ((), ()) if known is None else (known.defocus, known.tensors)
+    if missing := tuple(sorted({*defocus} - {*nodes})):
+        made = tuple(tensor.contiguous() for tensor in make(missing))
+        tensors = tuple(map(torch.cat, zip(tensors, made, strict=True))) if tensors else made
+        nodes = nodes + missing
+    # Sums are rounded in an order that follows the layout, so what comes out is laid out alike whatever is remembered.
+    places = [nodes.index(psi) for psi in defocus]
+    found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
+    storages = (tensor.untyped_storage() for tensor in (*tensors, *found))
+    nbytes = sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+    return _Remembered(nodes, tensors, defocus, form(*found), nbytes)
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
@@ -127,24 +156,3 @@ def present_intervals(nodes: tuple[float, ...], defocus: Tensor) -> list[bool]:
     if defocus.ndim == 1:
         present[int(interval.min()) : int(interval.max()) + 1] = True
     return present.tolist()
-
-
-def plain_attributes(*parts: nn.Module) -> list[Any]:
-    """Return the types and attributes of modules and submodules, but no parameters, buffers or hooks, to be compared.
-
-    Example:
-        >>> from kornia_tidy.modulator.modulator import DwellTimes
-        >>> plain_attributes(DwellTimes((3, 1)))
-        [<class 'kornia_tidy.modulator.modulator.DwellTimes'>, 'shares', (0.75, 0.25)]
-    """
-    found: list[Any] = []
-    for part in parts:
-        for module in part.modules():
-            found.append(type(module))
-            for name, value in vars(module).items():
-                if name not in _OF_EVERY_MODULE:
-                    # Containers are compared by their present values.
-                    found += name, value.tolist() if hasattr(value, "tolist") else value
-                    if isinstance(value, (list, dict, set)):
-                        found[-1] = repr(value)
-    return found

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor
-from typing import Any, NoReturn, Self, cast, overload
+from typing import Any, NoReturn, Self, cast
 
 import numpy as np
 import torch
@@ -39,7 +39,7 @@ from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import BankMemory, nodes_around, plain_attributes
+from kornia_tidy.psf.psf_cache import MEMORY, nodes_around
 from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
@@ -50,7 +50,6 @@ from kornia_tidy.psf.wide_psfs import is_flat, learnt_bank, wide_psfs
 Points = tuple[tuple[float, float], ...]
 AXIS: Points = ((0.0, 0.0),)
 MOST_FIELDS = 8  # sizes and places of pictures with remembered nodes
-MOST_PICTURES = 3  # the same with remembered PSFs: some 70 MB each, for 65 px and 72 nodes
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
@@ -63,12 +62,6 @@ class CachedParts:
         self.blur: WideBlur | None = None
         self.blur_known = False
         self.fields: dict[object, Field] = {}  # by size and place of the picture, and what else they follow from
-        self.light: tuple[object, Tensor, Tensor] | None = None  # what for, through which pupil, and over the field
-        self.lit: tuple[PSFBank, FieldBank] | None = None  # the last PSFs, and the same with their light
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what travels with pickle and deepcopy: no PSFs."""
-        return {**vars(self), "lit": None}
 
 
 class PSFModel:
@@ -118,9 +111,7 @@ class PSFModel:
     _sampled: Spectrum  # the spectrum, at no more wavelengths than the fidelity allows
     _derived: CachedParts
     _aperture_mark: object  # another one for each aperture that was set; it identifies remembered PSFs
-    # For each moment and state, for their averages, for each number of threads, grid and points of the field; None
-    # remembers no PSFs.
-    _memories: dict[tuple[int | None, int | None, int, int, Points], BankMemory] | None
+    _remembers: bool  # PSFs, and the matrices that they are made by
 
     def __init__(
         self,
@@ -132,7 +123,7 @@ class PSFModel:
         aperture: Tensor | LearnableAperture | None = None,
         lens: Lens | str | None = None,
     ) -> None:
-        vars(self).update(measured=None, state=None, moment=None, measured_cut=False, _memories={})
+        vars(self).update(measured=None, state=None, moment=None, measured_cut=False, _remembers=True)
         parts = self.replace(
             fidelity=Fidelity.of(fidelity),
             masks=PixelwiseMask() if masks is None else masks,
@@ -150,10 +141,6 @@ class PSFModel:
     def __setattr__(self, name: str, value: object) -> NoReturn:
         """Refuse: a model is a value."""
         raise AttributeError(f"{name} of a PSFModel cannot be set: take model.replace({name}=...)")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what travels with pickle and deepcopy: no PSFs."""
-        return {**vars(self), "_memories": None if self._memories is None else {}}
 
     def replace(self, **parts: Any) -> Self:
         """Return this model with other parts. Its window is measured when it is first asked for.
@@ -205,26 +192,6 @@ class PSFModel:
 
     # ------------------------------------------------------------------ PSFs
 
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        field: None = None,
-    ) -> PSFBank: ...
-
-    @overload
-    def psf_bank(
-        self,
-        channels: int | None = None,
-        dtype: torch.dtype | None = None,
-        defocus: Sequence[float] | None = None,
-        *,
-        field: Sequence[tuple[float, float]],
-    ) -> FieldBank: ...
-
     def psf_bank(
         self,
         channels: int | None = None,
@@ -232,8 +199,10 @@ class PSFModel:
         defocus: Sequence[float] | None = None,
         *,
         field: Sequence[tuple[float, float]] | None = None,
-    ) -> PSFBank | FieldBank:
+    ) -> Any:
         """Return the PSFs of the present masks, averaged over the exposure; gradients reach the masks.
+
+        A :class:`~kornia_tidy.psf.PSFBank`; over a field a :class:`~kornia_tidy.psf.FieldBank`.
 
         They are those of a point that reflects all wavelengths alike, whether or not the spectrum has a basis.
         Without gradients, PSFs are remembered while masks and camera do not change. Measured PSFs are mixed linearly
@@ -262,7 +231,9 @@ class PSFModel:
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
-        return self._computed_bank(spectrum.flat(), dtype, nodes).with_stray_light(self.fidelity.stray_light)
+        bank = self._computed_bank(spectrum.flat(), dtype, nodes)
+        own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # remembered ones stay as they are
+        return own.with_stray_light(self.fidelity.stray_light)
 
     def _lens_psfs(
         self,
@@ -287,12 +258,13 @@ class PSFModel:
         *,
         each_state: bool = False,
         device: torch.device | None = None,
-        points: Points = AXIS,
-    ) -> PSFBank:
+        field: Field | None = None,
+    ) -> Any:
         """Return the PSFs that a scene needs; of depths it does not hold there are none.
 
-        Where the spectrum has a basis, (D, C B, P, P): those of a channel follow each other. The bank may be given out
-        again: its tensors must not be changed.
+        A :class:`~kornia_tidy.psf.PSFBank`; over a field a :class:`~kornia_tidy.psf.FieldBank`. Where the spectrum has
+        a basis, (D, C B, P, P): those of a channel follow each other. The bank may be given out again: its tensors must
+        not be changed.
 
         Args:
             channels: of the image: those of the spectrum, or 1.
@@ -300,8 +272,7 @@ class PSFModel:
             defocus: the scene's defocus in radians, any shape.
             each_state: the PSFs of each state of the exposure in one bank, (D, S C, P, P), and not their average.
             device: of measured PSFs. Default: that of ``defocus``.
-            points: of the field, y and x in sensor pixels from the axis: (D, F C, P, P), those of a point follow each
-                other, and each PSF has the light that an ideal lens would give it. See :meth:`scene_field_bank`.
+            field: of the picture, behind a real lens: the PSFs at its nodes.
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
@@ -310,15 +281,16 @@ class PSFModel:
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         if kind in ("nearest", "linear"):
             held = nodes_around(nodes, defocus)
-            return self._computed_bank(spectrum, dtype, held, each_state, stray_light, points=points)
+            return self._computed_bank(spectrum, dtype, held, each_state, stray_light, field=field)
         targets = nodes_around(fine_nodes(nodes), defocus)
         spacing, guards = (nodes[-1] - nodes[0]) / (len(nodes) - 1), TAPS[kind] // 2
         first = floor((targets[0] - nodes[0]) / spacing + 1e-9) - guards
         last = ceil((targets[-1] - nodes[0]) / spacing - 1e-9) + guards
         samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
-        bank = self._computed_bank(spectrum, dtype, samples, each_state, points=points)
+        bank = self._computed_bank(spectrum, dtype, samples, each_state, field=field)
         band = self._band() if kind == "bandlimited" else None
-        return interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
+        bank = interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
+        return bank if field is None else self._lit(bank, spectrum, field)
 
     def _warn_if_beyond(self, points: Sequence[tuple[float, float]], nodes: Sequence[float]) -> None:
         lens = cast("Lens", self.lens)
@@ -326,33 +298,24 @@ class PSFModel:
         for wavelength in (min(self._sampled.wavelengths), max(self._sampled.wavelengths)):
             lens.warn_if_beyond(heights, torch.tensor(nodes, dtype=torch.float64), wavelength)
 
-    def scene_field_bank(self, channels: int, dtype: torch.dtype, defocus: Tensor, field: Field) -> FieldBank:
-        """Return the PSFs that a scene needs at the nodes of a field, see :meth:`scene_bank`.
+    def _lit(self, bank: PSFBank, spectrum: Spectrum, field: Field) -> FieldBank:
+        """Return PSFs over a field, (D, F C, P, P) and each with the light that an ideal lens would give it, lit."""
+        lens, pitch, pupil = cast("Lens", self.lens), self.camera.pixel_pitch, self.pupil
+        passed, flat, nodes = pupil.transmission, spectrum.flat(), tuple(bank.defocus.tolist())
 
-        Args:
-            channels: of the image: those of the spectrum, or 1.
-            dtype: float32 or float64.
-            defocus: the scene's defocus in radians, any shape.
-            field: of the picture.
-        """
-        bank, derived = self.scene_bank(channels, dtype, defocus, points=field.points), self._derived
-        if (known := derived.lit) is None or known[0] is not bank:
-            lens, pitch = cast("Lens", self.lens), self.camera.pixel_pitch
-            pupil, asked = self.pupil, (bank.defocus.tolist(), field.points, channels, lens.table, pitch)
-            passed, found = pupil.transmission, derived.light
-            if found is None or found[0] != asked or passed.requires_grad or not torch.equal(found[1], passed):
-                given = pupil, self.spectrum_of(channels).flat(), *asked[:2], lens, pitch
-                found = asked, passed, field_light(*given)
-                derived.light = None if passed.requires_grad else found
-            light = found[2].to(bank.psfs)
-            light = light.repeat_interleave(bank.psfs.shape[1] // light[:, 0].numel(), 2)
-            each, within = (-1, light.shape[-1]), light.movedim(1, 0)
-            psfs = bank.psfs.unflatten(1, each) * within[..., None, None]
-            veil = None if bank.veil is None else (bank.veil.unflatten(1, each) * within).movedim(1, 0)
-            energy, places = bank.energy.unflatten(1, each).movedim(1, 0), bank.psfs.new_tensor(field.points)
-            known = bank, FieldBank(psfs.movedim(1, 0), bank.defocus, places, energy, light, veil)
-            derived.lit = None if psfs.requires_grad else known
-        return known[1]
+        def light_at(nodes: tuple[float, ...]) -> tuple[Tensor]:
+            return (field_light(pupil, flat, nodes, field.points, lens, pitch).movedim(1, 0),)
+
+        parts = "light", passed, pupil.cell_pitch, flat, field.points, lens.table, pitch, torch.get_num_threads()
+        new = passed.requires_grad or torch_mode() & Mode.TRACED or not self._remembers
+        (light,) = light_at(nodes) if new else MEMORY.recall(parts, nodes, light_at)
+        light = light.to(bank.psfs)
+        light = light.repeat_interleave(bank.psfs.shape[1] // light[0].numel(), 2)  # (D, F, C)
+        psfs, energy = (own.unflatten(1, (-1, light.shape[-1])) for own in (bank.psfs, bank.energy))
+        veil = None if bank.veil is None else (bank.veil.unflatten(1, (-1, light.shape[-1])) * light).movedim(1, 0)
+        lit, places = psfs * light[..., None, None], bank.psfs.new_tensor(field.points)
+        rest = energy.movedim(1, 0), light.movedim(1, 0), veil
+        return FieldBank(lit.movedim(1, 0), bank.defocus, places, *rest)
 
     def field_of(self, size: tuple[int, int], center: tuple[float, float] = (0.0, 0.0)) -> Field | None:
         """Return where over a picture PSFs are to be known for the fidelity's tolerance; None for an ideal lens.
@@ -409,20 +372,21 @@ class PSFModel:
         each_state: bool = False,
         stray_light: tuple[str, int] | None = None,
         group: BlurGroup | None = None,
-        points: Points = AXIS,
-    ) -> PSFBank:
-        """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid."""
+        field: Field | None = None,
+    ) -> Any:
+        """Return the PSFs at these nodes, computed or remembered; those of a group of wide blur on its grid.
+
+        Those of a field are (D, F C, P, P) before stray light is dealt with, and a bank over the field after that.
+        """
         states, weights = self.states(dtype)
         traced = torch_mode() & Mode.TRACED
         side, grid = self.window if traced else self.fitted.side, 1  # the light in it is measured at the first PSFs
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        compared = weights
-        if isinstance(self.aperture, LearnableAperture):
-            amplitude = self.pupil.amplitude.to(weights)
-            learning, compared = learning or amplitude.requires_grad, torch.cat([weights, amplitude.flatten()])
-        exact = partial(self._exact_psfs, spectrum, grid, points=points)
+        amplitude = self.pupil.amplitude if isinstance(self.aperture, LearnableAperture) else None
+        learning = learning or (amplitude is not None and torch.is_grad_enabled() and amplitude.requires_grad)
+        exact = partial(self._exact_psfs, spectrum, grid, points=AXIS if field is None else field.points)
         build = partial(exact, states, weights, window=side, each_state=each_state)
         if (blur := self.wide_blur) is not None and not traced and not each_state:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
@@ -433,22 +397,41 @@ class PSFModel:
             shares = [sum(row) for row in spectrum.plane_weights]
             lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
-        memories, unread = self._memories, Mode.UNREAD in torch_mode()
-        if memories is None or learning or traced or unread or next(self.camera.parameters(), None) is not None:
-            bank = build(nodes)
-            return bank if stray_light is None else bank.with_stray_light(*stray_light)
-        setting = [side, self.fidelity, self._aperture_mark, getattr(self.modulator, "fill_factor", 1.0)]
-        setting += [None if self.lens is None else self.lens.table]
-        setting += plain_attributes(self.masks, self.camera)
+
+        def finished(nodes: tuple[float, ...]) -> PSFBank | FieldBank:
+            bank = build(nodes) if stray_light is None else build(nodes).with_stray_light(*stray_light)
+            return bank if field is None or stray_light is None else self._lit(bank, spectrum, field)
+
+        unread = Mode.UNREAD in torch_mode()
+        if not self._remembers or learning or traced or unread or next(self.camera.parameters(), None) is not None:
+            return finished(nodes)
+        points = None if field is None else field.points
+        over = points is not None and stray_light is not None
+        names = [
+            "psfs",
+            "energy",
+            *["light"] * over,
+            *["veil"] * (stray_light is not None and stray_light[0] == "veil"),
+        ]
+
+        def tensors_of(nodes: tuple[float, ...]) -> tuple[Tensor, ...]:  # with depths first
+            bank = finished(nodes)
+            return bank.defocus, *(getattr(bank, name).movedim(int(over), 0) for name in names)
+
+        def bank_of(defocus: Tensor, *tensors: Tensor) -> PSFBank | FieldBank:
+            own = {name: tensor.movedim(0, int(over)) for name, tensor in zip(names, tensors, strict=True)}
+            return (
+                FieldBank(defocus=defocus, field=defocus.new_tensor(points), **own)
+                if over
+                else PSFBank(defocus=defocus, **own)
+            )
+
         # Sums of another number of threads are rounded in another order.
-        key = self.moment, self.state, torch.get_num_threads(), grid, points
-        if points != AXIS and key not in memories:
-            fields = list(dict.fromkeys(k[-1] for k in list(memories) if k[-1] != AXIS))
-            oldest = fields[: max(0, len(fields) + 1 - MOST_PICTURES)]
-            for other in [k for k in list(memories) if k[-1] in oldest]:
-                memories.pop(other, None)
-        memory = memories.get(key) or memories.setdefault(key, BankMemory())
-        return memory.recall(spectrum, setting, states, compared, nodes, build, stray_light)
+        parts = spectrum, side, grid, each_state, stray_light, points
+        lens = self.fidelity, self._aperture_mark, getattr(self.modulator, "fill_factor", 1.0)
+        table, threads = None if self.lens is None else self.lens.table, torch.get_num_threads()
+        seen = states, weights, amplitude, self.masks, self.camera, *self.camera.buffers()
+        return MEMORY.recall((*parts, *lens, table, threads, *seen), nodes, tensors_of, bank_of)
 
     def _exact_psfs(
         self,
@@ -498,7 +481,7 @@ class PSFModel:
         plain = isinstance(self.aperture, LearnableAperture) or each_state  # compiled as plain operations
         if torch_mode() == Mode.GRAPH and not (plain or isinstance(step, Tensor)):
             return operator_psf_bank(*light, step, window, tolerance, shift)
-        return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._memories is not None)
+        return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._remembers)
 
     def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
         bank = cast("PSFBank", self.measured)
@@ -566,7 +549,7 @@ class PSFModel:
             >>> PSFModel().without_memory().psf_bank(defocus=[0.0]).psfs.shape[:2]
             torch.Size([1, 3])
         """
-        return self._replace(_memories=None)
+        return self._replace(_remembers=False)
 
     def through_state(self, state: int) -> Self:
         """Return this model with one state of its modulator shown all the time. The parts and the window are shared.

@@ -7,7 +7,6 @@ only the arguments are kept between the two.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,7 +17,7 @@ from kornia_tidy.mode import recording_in_operator
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import BankMemory
+from kornia_tidy.psf.psf_cache import MEMORY
 from kornia_tidy.psf.pupil import Pupil
 
 _LENS = (
@@ -27,8 +26,6 @@ _LENS = (
     " float[] defocus, float pixel_step, int window, float tolerance"
 )
 _TENSORS = 3
-_REMEMBERED_BYTES = 64 << 20  # larger banks are computed anew each time
-_memory = BankMemory()
 
 torch.library.define("kornia_tidy::exact_psfs", f"({_LENS}) -> Tensor")
 torch.library.define("kornia_tidy::exact_psfs_gradients", f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]")
@@ -87,20 +84,14 @@ def _computed(*arguments: Any) -> Tensor:
 
 
 def _psfs(*arguments: Any) -> Tensor:
-    phase, weights, amplitude, *lens = arguments
-    nodes = tuple(lens.pop(-4))
-    setting = [tuple(x) if isinstance(x, list) else x for x in lens]
-    setting += [tuple(amplitude.shape), torch.get_num_threads()]
+    shown, (*lens, nodes, step, window, tolerance) = arguments[:_TENSORS], arguments[_TENSORS:]
+    parts = *(tuple(x) if isinstance(x, list) else x for x in lens), step, window, tolerance, torch.get_num_threads()
 
-    def build(missing: tuple[float, ...]) -> PSFBank:
-        psfs = _computed(*arguments[:-4], missing, *arguments[-3:])
-        return PSFBank(psfs, psfs.new_tensor(missing), psfs.sum((2, 3)))
+    def make(missing: tuple[float, ...]) -> tuple[Tensor]:
+        return (_computed(*arguments[:-4], missing, step, window, tolerance),)
 
-    with torch.no_grad(), torch.autocast(phase.device.type, enabled=False):
-        if math.prod(_shape(*arguments)) * phase.element_size() > _REMEMBERED_BYTES:
-            return build(nodes).psfs
-        compared = torch.cat([weights, amplitude.to(weights).flatten()])
-        return _memory.recall("exact", setting, phase, compared, nodes, build).psfs
+    with torch.autocast(arguments[0].device.type, enabled=False):
+        return MEMORY.recall((*shown, *parts), tuple(nodes), make)[0].clone()
 
 
 def _shape(*arguments: Any) -> tuple[int, ...]:

@@ -64,7 +64,7 @@ def restored_over_field(
     dtype = torch.promote_types(capture.dtype, torch.float32)
     if (field := model.field_of(size, center)) is None:
         return restore(capture, model.scene_bank(capture.shape[1], dtype, ends, device=capture.device))
-    bank, reach = model.scene_field_bank(capture.shape[1], dtype, ends, field), model.window - 1
+    bank, reach = model.scene_bank(capture.shape[1], dtype, ends, field=field), model.window - 1
     total = torch.zeros_like(capture, dtype=dtype)
     (rows, down), (columns, across) = (_places(side, tile) for side in size)
     done, tiles = 0, len(rows) * len(columns)

@@ -121,9 +121,8 @@ def pieces_of(
         if _MOST_COPIES * channels * dtype.itemsize * len(model.defocus_nodes) * side**2 * points > budget // 2:
             most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget, points)
     source = model if remembered else model.without_memory()
-    make: Callable[..., Any] = PSFModel.scene_bank if field is None else PSFModel.scene_field_bank
-    where = {"device": device or reach.device} if field is None else {"field": field}
-    make = partial(make, channels=channels, dtype=dtype, **where)
+    given: dict[str, Any] = {"channels": channels, "dtype": dtype, "device": device or reach.device, "field": field}
+    make: Callable[..., Any] = partial(PSFModel.scene_bank, **given)
     if compositing == "occlusion" and (blur is not None or model.measured_cut):  # discs of rays end
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":

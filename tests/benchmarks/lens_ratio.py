@@ -55,7 +55,7 @@ def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) ->
     field = real.psf_model.field_of(size, field_center)
     assert isinstance(field, Field)
     with torch.no_grad():
-        bank = real.psf_model.scene_field_bank(3, image.dtype, psi, field)
+        bank = real.psf_model.scene_bank(3, image.dtype, psi, field=field)
     psfs = bank.psfs.clone().requires_grad_()
     learnt = replace(bank, psfs=psfs)
     rendering = Rendering(compositing, "reflect")

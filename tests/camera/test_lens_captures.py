@@ -308,11 +308,6 @@ class TestLensCaptures(BaseTester):
         sizes = [(24, 24), (24, 30), (30, 24), (24, 24)]
         captures = [optics(*scene(*size)) for size in sizes]
         assert torch.equal(captures[0], captures[-1])
-        fields = {key[-1] for key in optics.psf_model._memories} - {((0.0, 0.0),)}
-        assert len(fields) == 3
-        optics(*scene(40, 24))
-        kept = {key[-1] for key in optics.psf_model._memories} - {((0.0, 0.0),)}
-        assert len(kept) == 3
         assert len(pickle.dumps(optics)) < len(pickle.dumps(camera())) + 20_000
 
     @torch.no_grad()

@@ -109,7 +109,7 @@ class TestThreads(BaseTester):
 
     def test_feature_lenses_that_evict_what_others_remember(self, monkeypatch):
         """Kernels of PSFs are remembered for the process: here so few that each lens drops those of the others."""
-        monkeypatch.setattr(exact, "_MOST_BYTES", 1 << 16)
+        monkeypatch.setattr(exact.MEMORY, "most_bytes", 1 << 16)
         with one_thread_each(), torch.no_grad():
             lenses = [ThinLensCamera(focus_distance=0.5 + 0.1 * i) for i in range(THREADS)]
 
@@ -133,15 +133,6 @@ class TestThreads(BaseTester):
         monkeypatch.setattr(module, "exact_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
         for sample in SAMPLES:
             optics(*sample)
-
-    @torch.no_grad()
-    def test_feature_no_more_banks_are_kept_than_that(self):
-        optics = camera()
-        for wavelength in range(460, 640, 20):
-            optics.spectrum = module.Spectrum.monochrome(wavelength * 1e-9)
-            optics(*SAMPLES[2])
-        (memory,) = optics.psf_model._memories.values()
-        assert len(memory._banks) == 4
 
     def test_feature_gradients_in_threads_are_those_of_one(self):
         optics = camera()

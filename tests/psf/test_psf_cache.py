@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.psf import exact
 from kornia_tidy.psf import psf_model as module
+from kornia_tidy.psf.psf_cache import PSFMemory
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)
@@ -57,7 +59,7 @@ class TestOnlyWhatTheSceneRequires(BaseTester):
         assert float(depth.grad.abs().max()) > 0
 
 
-class TestBankMemory(BaseTester):
+class TestPSFMemory(BaseTester):
     @torch.no_grad()
     def test_feature_without_gradients_each_depth_is_computed_once(self, optics):
         assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 2
@@ -114,3 +116,44 @@ class TestBankMemory(BaseTester):
         coded.sum().backward()
         assert image.grad is not None
         self.assert_close(coded, expected)
+
+    @torch.no_grad()
+    def test_feature_the_same_whatever_depths_were_asked_for_before(self, optics, monkeypatch):
+        """Far depths take more points in the pupil; near focus they must not change the last bit."""
+        found = []
+        for before in ([], [-20.0, 0.0]):
+            for place in (exact, module):
+                monkeypatch.setattr(place, "MEMORY", PSFMemory())
+            if before:
+                optics.psf_bank(defocus=before)
+            found.append(optics.psf_bank(defocus=[-0.5, 0.0, 0.5]).psfs)
+        assert torch.equal(*found)
+
+    def test_feature_what_was_not_used_for_long_goes(self):
+        memory, asked = PSFMemory(3 * 40), []
+
+        def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:
+            asked.append(nodes)
+            return (torch.zeros(len(nodes), 5, dtype=torch.float64),)
+
+        for kind in ("one", "two", "three", "one", "four", "one", "two"):
+            memory.recall([kind], (0.0,), make)
+        assert len(asked) == 5  # "two" again
+        memory.recall(["five"], (0.0, 1.0, 2.0, 3.0), make)
+        assert not memory._held  # larger than all that may be kept
+
+    def test_feature_what_comes_out_does_not_depend_on_what_is_remembered(self):
+        def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:
+            return (torch.tensor(nodes)[:, None].expand(-1, 3),)
+
+        memory = PSFMemory()
+        for nodes in ((1.0,), (0.0, 2.0), (0.0, 1.0, 2.0, 3.0), (0.0, 3.0)):
+            (found,) = memory.recall([], nodes, make)
+            assert found.tolist() == [[psi] * 3 for psi in nodes]
+            assert found.is_contiguous()
+
+    def test_exception_nothing_is_kept_of_what_could_not_be_made(self):
+        memory = PSFMemory()
+        with pytest.raises(ZeroDivisionError):
+            memory.recall(["one"], (0.0,), lambda _: (torch.ones(1) * (1 // 0),))
+        assert not memory._held

@@ -9,7 +9,7 @@ from torch._dynamo.testing import CompileCounter
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.psf import psf_ops
 from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.psf_cache import BankMemory
+from kornia_tidy.psf.psf_cache import PSFMemory
 from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester
@@ -39,7 +39,7 @@ def arguments(phase, weights, *, basis=()):
 @pytest.fixture(autouse=True)
 def forgetful(monkeypatch):
     """No PSFs of other tests."""
-    monkeypatch.setattr(psf_ops, "_memory", BankMemory())
+    monkeypatch.setattr(psf_ops, "MEMORY", PSFMemory())
 
 
 class TestOperatorPSFBank(BaseTester):
@@ -95,9 +95,9 @@ class TestOperatorPSFBank(BaseTester):
         assert first.data_ptr() != second.data_ptr()  # each may be written to
 
     def test_feature_large_banks_are_not_kept(self, monkeypatch):
-        monkeypatch.setattr(psf_ops, "_REMEMBERED_BYTES", 3 * 2 * 9 * 9 * 8 - 1)
+        monkeypatch.setattr(psf_ops, "MEMORY", memory := PSFMemory(3 * 2 * 9 * 9 * 8 - 1))
         operator_psf_bank(*masks(), pupil(), SPECTRUM, *LENS)
-        assert not psf_ops._memory._banks
+        assert not memory._held
 
     def test_gradcheck(self):
         phase, weights = (x.requires_grad_() for x in masks(2, 3))
