@@ -104,7 +104,7 @@ def rendering_work(
     backend = choose(one)
     if field is None:
         return backend.work(scene)
-    over = replace(scene, psfs=psfs.expand(len(field.points), *psfs.shape), field=field, found={})
+    over = replace(scene, psfs=psfs.expand(len(field.points), *psfs.shape), field=field)
     if refusal(backend, over) is None:
         return backend.work(over)
     work = backend.work(scene)  # cell by cell, a value and two gradients

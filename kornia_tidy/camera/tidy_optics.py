@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import reduce
 from operator import add
@@ -241,7 +242,10 @@ class TiDyOptics(CameraState):
         """
         sample, coded = read_sample(image, depth, self, generator, deferred=True, field_center=field_center), None
         device, dtype = sample.image.device, sample.image.dtype
-        with torch.autocast(device.type, enabled=False), values_unread(device):  # float32 or better throughout
+        with (
+            torch.autocast(device.type, enabled=False),
+            nullcontext() if device.type == "cpu" else values_unread(device),
+        ):
             for strip in self.strips(sample):  # one, of the whole picture, unless memory is short
                 seen, rows = self.blurred(strip), strip.rows or slice(0, None)
                 if self.sensor is not None:
@@ -301,7 +305,10 @@ class TiDyOptics(CameraState):
     def irradiance(self, sample: Sample) -> Tensor:
         """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""
         whole, device = None, sample.image.device
-        with torch.autocast(device.type, enabled=False), values_unread(device):
+        with (
+            torch.autocast(device.type, enabled=False),
+            nullcontext() if device.type == "cpu" else values_unread(device),
+        ):
             for strip in self.strips(sample):
                 part = self.blurred(strip)
                 whole = part if strip.rows is None else placed(whole, part, strip.rows, self.height(sample))

@@ -120,8 +120,7 @@ def _with_depths(
     # Sums are rounded in an order that follows the layout, so what comes out is laid out alike whatever is remembered.
     places = [nodes.index(psi) for psi in defocus]
     found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
-    storages = (tensor.untyped_storage() for tensor in (*tensors, *found))
-    nbytes = sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+    nbytes = sum(tensor.nbytes for tensor in (*tensors, *(() if found is tensors else found)))
     return _Remembered(nodes, tensors, defocus, form(*found), nbytes)
 
 

@@ -1,37 +1,35 @@
 """The batched backend: batches of transforms of torch, on any device.
 
-On a processor each block of two tiles is convolved with the PSFs of the layers that it contains and with no other. A
-kernel of an accelerator takes some microseconds to launch, and a wait for a value many more: there all layers are
-convolved, of whole planes or of tiles as large as memory allows, and no value of the scene is looked at.
+On a processor tiles are convolved with the PSFs of the layers that they hold and with no other. A kernel of an
+accelerator takes some microseconds to launch, and a wait for a value many more: there all layers are convolved, of
+whole planes or of tiles as large as memory allows, and no value of the scene is looked at.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, product
 
+import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.precision import widest
-from kornia_tidy.kernels.window_sides import needed_side, next_fast_size
+from kornia_tidy.kernels.window_sides import next_fast_size
 from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.dense import dense_work
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import LayerSums, blend_gradients, seen
-from kornia_tidy.render.backends.tile_occlusion import occlude_tiles, tile_gradients
-from kornia_tidy.render.backends.tile_sums import TileSums
-from kornia_tidy.render.backends.tiles import Grid, Plan, plan_pairs
-from kornia_tidy.render.backends.whole_occlusion import occlude_whole, whole_gradients
-from kornia_tidy.render.backends.whole_sums import WholeSums
+from kornia_tidy.render.backends.layer_batches import LayerBatches, Part
+from kornia_tidy.render.backends.layer_sums import blend_gradients, present_in_tiles, seen
+from kornia_tidy.render.backends.occlusion_batches import occlude_parts, part_gradients
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
-PART_BYTES = 672 << 20  # that the planes of a chunk may take on an accelerator
+PART_BYTES = 672 << 20  # that the planes of a part may take on an accelerator
 _STEP = 16  # samples that divide windows on processors: transforms of other sizes take up to twice as long
 _PRODUCT = 6  # operations of a complex product
-# Planes of a pair at a time, for occlusion in each channel: spectra, products, light and quotients.
+_LAYERS = 6  # of a tile: beyond these planes channels are worked on one by one
+# Planes of a layer at a time, for occlusion in each channel: spectra, products, light and quotients.
 _PLANES, _OCCLUSION_PLANES = 3, 6
 
 
@@ -41,10 +39,10 @@ class BatchedBackend:
 
     Args:
         smallest: side of the smallest windows on a processor: calls of smaller ones take longer than their transforms.
-        chunk_bytes: that the planes of a chunk may take on a processor, near its cache (see allocator.py).
+        chunk_bytes: that the planes of a tile may take on a processor, near its cache (see allocator.py).
     """
 
-    smallest: int = 64
+    smallest: int = 80
     chunk_bytes: int = 15 << 20
 
     name = "batched"
@@ -56,97 +54,119 @@ class BatchedBackend:
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64 where the device has it."""
         if scene.compositing == "occlusion":
-            planes = occlusion_planes(scene)
-            return occlude_whole(planes, PART_BYTES) if _is_whole(scene) else occlude_tiles(planes, self.plan(scene))
-        sums = self._sums(scene)
-        if scene.compositing == "gather":
-            return sums.gather(scene.plane)
-        return seen(scene, sums.scatter(scene.plane))
+            return occlude_parts(occlusion_planes(scene), self.parts(scene), self._most_bytes(scene))
+        sums = LayerBatches(scene, self.parts(scene))
+        return sums.gather(scene.plane) if scene.compositing == "gather" else seen(scene, sums.scatter(scene.plane))
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of the planes, of the PSFs and of the layers' weights."""
         if scene.compositing != "occlusion":
-            return blend_gradients(scene, self._sums(scene), gradient)
-        planes = occlusion_planes(scene)
-        if _is_whole(scene):
-            return whole_gradients(planes, gradient, PART_BYTES)
-        return tile_gradients(planes, self.plan(scene), gradient)
-
-    def _sums(self, scene: LayeredScene) -> LayerSums:
-        if _is_whole(scene):
-            return WholeSums(scene, PART_BYTES)
-        return TileSums(scene, self.plan(scene), self.together(scene, self.grid(scene)))
+            return blend_gradients(scene, LayerBatches(scene, self.parts(scene)), gradient)
+        return part_gradients(occlusion_planes(scene), self.parts(scene), gradient, self._most_bytes(scene))
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work, on a processor with the layers in every eighth row and column of the tiles."""
-        every = len(scene.psfs)
+        every, labels, channels = len(scene.psfs), scene.labels, scene.image.shape[1]
         if _is_whole(scene):
             return dense_work(scene, every, at_once=every)
-        labels, channels, grid = scene.labels, scene.image.shape[1], self.grid(scene)
-        pairs, layers, most = grid.blocks * every, every, every
+        occludes, (height, width) = scene.compositing == "occlusion", self.tile(scene)
+        lost, size = scene.psfs.shape[-1] - 1, _pixels(scene)
+        tiles = len(scene.image) * -(-size[0] // height) * -(-size[1] // width)
+        pairs, layers, most = tiles * every, every, every
         if scene.image.device.type == "cpu":
-            held = grid.present(labels.every(SAMPLE), every, SAMPLE)
+            reach = lost if occludes else 0
+            held = present_in_tiles(labels.every(SAMPLE), (height, width), every, reach, SAMPLE)
             pairs, layers, most = (int(number) for number in (held.sum(), held.any(0).sum(), held.sum(1).max()))
         image = channels * labels.layer_index.numel() * scene.image.element_size()
-        samples, transform = math.prod(grid.size), 2 * transform_operations(*grid.size)  # of complex planes
-        plane, chunk = channels * self._plane_bytes(scene, grid), self._chunk_bytes(scene)
-        if scene.compositing == "occlusion":  # in float64, where operations take twice as long
+        sides = next_fast_size(height + lost), next_fast_size(width + lost)
+        samples, transform = sides[0] * sides[1], transform_operations(*sides)
+        plane = channels * self._plane_bytes(scene, sides)
+        if occludes:  # in float64, where operations take twice as long
             operations = 2 * ((4 * channels + 2) * transform + 3 * channels * _PRODUCT * samples) * pairs
-            memory = 2 * layers * plane + max(chunk, _OCCLUSION_PLANES * plane * most)
-            return Work(operations, memory + 2 * image + 32 * labels.layer_index.numel(), max(grid.size))
-        operations = transform * (grid.blocks + pairs + layers) + _PRODUCT * samples * pairs
+            memory = 2 * layers * plane + max(self._most_bytes(scene), _OCCLUSION_PLANES * plane * most)
+            return Work(operations, memory + 2 * image + 32 * labels.layer_index.numel(), max(sides))
+        operations = transform * (tiles + pairs + layers) + _PRODUCT * samples // 2 * pairs
         operations *= channels * scene.image.element_size() // 4
-        memory = 2 * layers * plane + max(chunk, _PLANES * plane * most // channels)
-        return Work(operations, memory + 4 * image + 16 * labels.layer_index.numel(), max(grid.size))
+        memory = 2 * layers * plane + max(self._most_bytes(scene), _PLANES * plane * most // channels)
+        return Work(operations, memory + 4 * image + 16 * labels.layer_index.numel(), max(sides))
 
-    def grid(self, scene: LayeredScene) -> Grid:
-        """Return the tiles of a scene: in windows of some 2.5 P pixels, or as few as an accelerator's memory allows.
+    def tile(self, scene: LayeredScene) -> tuple[int, int]:
+        """Return height and width of tiles: in windows of some 2.5 P pixels, or as large as an accelerator allows.
 
         Larger tiles waste less on their overlap, smaller ones hold fewer layers.
         """
-        occludes, side, batch = scene.compositing == "occlusion", scene.psfs.shape[-1], len(scene.image)
-        height, width = scene.padded_size if scene.compositing == "scatter" else scene.output_size
-        half = -(-width // 2)
+        side, size = scene.psfs.shape[-1], _pixels(scene)
+        if _is_whole(scene):
+            return size
         if scene.image.device.type == "cpu":
-            sizes = count(max(self.smallest, -(-5 * side // (2 * _STEP)) * _STEP), _STEP)
-            size = next(size for size in sizes if next_fast_size(size) == size)
-            sides = needed_side(size, height, side, _STEP), needed_side(size, half, side, _STEP)
-            return Grid(batch, (height, width), side - 1, sides, 2, occludes)
-        tile = height
-        while True:
-            sides = next_fast_size(tile + side - 1), next_fast_size(half + side - 1)
-            grid = Grid(batch, (height, width), side - 1, sides, 2, occludes)
-            if tile <= side or self._pairs(scene, grid) >= len(scene.psfs):
-                return grid
-            tile = -(-tile // 2)
+            windows = count(max(self.smallest, -(-5 * side // (2 * _STEP)) * _STEP), _STEP)
+            most = next(window for window in windows if next_fast_size(window) == window) - side + 1
+        else:
+            planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
+            most = max(size)
+            while (
+                most > side
+                and self._plane_bytes(scene, (most + side, most + side)) * planes * len(scene.psfs) > PART_BYTES
+            ):
+                most = -(-most // 2)
+        height, width = (-(-own // -(-own // most)) for own in size)  # alike, so that few sizes are transformed
+        return height, width
 
-    def plan(self, scene: LayeredScene) -> Plan:
-        """Return the pairs of blocks and layers of a scene, in chunks."""
-        keep_memory()
-        grid = self.grid(scene)
-        return plan_pairs(grid, scene.labels, len(scene.psfs), self._pairs(scene, grid) // self.together(scene, grid))
+    def parts(self, scene: LayeredScene) -> list[Part]:
+        """Return the parts that a scene is rendered in."""
+        batch, channels = scene.image.shape[:2]
+        (height, width), size, every = self.tile(scene), _pixels(scene), len(scene.psfs)
+        rows, columns = (
+            [slice(first, min(first + own, whole)) for first in range(0, whole, own)]
+            for own, whole in ((height, size[0]), (width, size[1]))
+        )
+        lost = scene.psfs.shape[-1] - 1
+        one = self._plane_bytes(scene, (next_fast_size(height + lost), next_fast_size(width + lost)))
+        here, occludes, most = (
+            scene.image.device.type == "cpu",
+            scene.compositing == "occlusion",
+            self._most_bytes(scene),
+        )
+        layers, together, images = min(every, _LAYERS) if here else every, channels, 1
+        if _is_whole(scene):
+            images = batch if occludes else max(1, most // (every * channels * one))
+        elif not occludes and _PLANES * layers * channels * one > most:
+            together = 1
+        if here:
+            keep_memory()
+        found = []
+        for first, y, x in product(range(0, batch, images), rows, columns):
+            own, held = slice(first, first + images), None
+            if here:
+                held = _held(scene, own, y, x, lost if occludes else 0)
+            found += [Part(own, slice(c, c + together), y, x, held) for c in range(0, channels, together)]
+        return found
 
-    def together(self, scene: LayeredScene, grid: Grid) -> int:
-        """Return the channels that gather and scatter work on together: one, or all where memory allows."""
-        every, channels = scene.psfs.shape[:2]
-        if scene.compositing == "occlusion" or scene.image.device.type == "cpu":
-            return 1
-        return channels if every * channels <= self._pairs(scene, grid) else 1
-
-    def _pairs(self, scene: LayeredScene, grid: Grid) -> int:
-        """Return how many pairs fit into a chunk: in one channel, or for occlusion in all of them."""
-        planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
-        return self._chunk_bytes(scene) // (planes * self._plane_bytes(scene, grid))
-
-    def _chunk_bytes(self, scene: LayeredScene) -> int:
+    def _most_bytes(self, scene: LayeredScene) -> int:
         return self.chunk_bytes if scene.image.device.type == "cpu" else PART_BYTES
 
-    def _plane_bytes(self, scene: LayeredScene, grid: Grid) -> int:
+    def _plane_bytes(self, scene: LayeredScene, sides: tuple[int, int]) -> int:
         dtype = widest(scene.image.device) if scene.compositing == "occlusion" else scene.image.dtype
-        return math.prod(grid.size) * dtype.to_complex().itemsize
+        return sides[0] * sides[1] * dtype.itemsize
+
+
+def _pixels(scene: LayeredScene) -> tuple[int, int]:
+    """Return height and width of the pixels that tiles divide: those whose layers count, for occlusion the output's."""
+    return scene.padded_size if scene.compositing == "scatter" else scene.output_size
+
+
+def _held(scene: LayeredScene, images: slice, rows: slice, columns: slice, reach: int) -> Tensor:
+    """Return the layers around the pixels of a part, ascending."""
+    index, weight = scene.sorted_layers
+    window = Part(images, slice(None), rows, columns, None).window(index, reach)
+    held = torch.bincount(window.flatten(), minlength=len(scene.psfs)) > 0
+    if weight is not None:
+        held[1:] |= held[:-1].clone()
+    return held.nonzero()[:, 0]
 
 
 def _is_whole(scene: LayeredScene) -> bool:
     """Return whether whole planes are worked on: on an accelerator, while they are not too large for it."""
-    samples = len(scene.psfs) * math.prod((*scene.image.shape[:2], *scene.padded_size))
+    height, width = scene.padded_size
+    samples = len(scene.psfs) * scene.image.shape[0] * scene.image.shape[1] * height * width
     return scene.image.device.type != "cpu" and samples <= MOST_SAMPLES

@@ -11,6 +11,7 @@ Where a capture is gathered, its gradient is scattered, and the other way round,
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Protocol
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
-from kornia_tidy.render.scene import LayeredScene
+from kornia_tidy.render.scene import Labels, LayeredScene
 
 
 class LayerSums(Protocol):
@@ -41,6 +42,33 @@ class LayerSums(Protocol):
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return (D, C, P, P) of a plane and of pixels, turned where gather and scatter take the PSFs turned."""
         ...
+
+
+def present_in_tiles(labels: Labels, tile: tuple[int, int], layers: int, reach: int = 0, step: int = 1) -> Tensor:
+    """Return (tiles, D) bool: which layers each tile of a batch of planes holds, image by image and row by row.
+
+    Args:
+        labels: of every ``step``-th row and column.
+        tile: height and width.
+        layers: D.
+        reach: pixels beyond the tiles, to the right and below, that count too.
+        step: between labels.
+    """
+    (batch, *shape), device = labels.layer_index.shape, labels.layer_index.device
+    counts = [max(1, -(-(side * step - reach) // own)) for side, own in zip(shape, tile, strict=True)]
+    present = torch.zeros(batch * counts[0] * counts[1] * layers, dtype=torch.bool, device=device)
+    images = torch.arange(batch, device=device)[:, None, None]
+    for back in product({0, reach}, repeat=2):  # windows reach into the next tile only
+        rows, columns = (
+            ((torch.arange(side, device=device) * step - own) // long).clamp_(0, most - 1)
+            for side, own, long, most in zip(shape, back, tile, counts, strict=True)
+        )
+        for first in range(0, len(rows), 64):  # in a processor's cache
+            part = slice(first, first + 64)
+            keys = ((images * counts[0] + rows[part, None]) * counts[1] + columns) * layers
+            for layer in labels.terms(slice(None), part):
+                present.index_fill_(0, (keys + layer).flatten(), True)
+    return present.view(-1, layers)
 
 
 def seen(scene: LayeredScene, spread: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends import batched
 from kornia_tidy.render.backends.batched import BatchedBackend
-from kornia_tidy.render.backends.tiles import Grid, plan_pairs
+from kornia_tidy.render.backends.layer_sums import present_in_tiles
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.scene import Labels, layered_scene
@@ -181,33 +181,33 @@ class LargestTensor(TorchDispatchMode):
         return out
 
 
-class TestPlan(BaseTester):
+class TestTiles(BaseTester):
     @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.parametrize("windowed", [False, True])
-    def test_feature_pairs_are_the_layers_that_blocks_or_their_windows_contain(self, kind, windowed):
+    @pytest.mark.parametrize("reach", [0, 4])
+    def test_feature_layers_are_those_that_tiles_or_their_windows_hold(self, kind, reach):
         """Counted pixel by pixel."""
-        bank, lost = make_bank(6, 1, 5), 4 if windowed else 0
-        psi = depth_map(kind, bank, 37 + lost, 51 + lost)
+        bank = make_bank(6, 1, 5)
+        psi = depth_map(kind, bank, 37 + reach, 51 + reach)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
-        grid = Grid(2, (37, 51), 4, (16, 16), 2, windowed)
-        plan, (down, across) = plan_pairs(grid, Labels(label, None), 6, limit=9), grid.tile
-        found, numbers = {}, []
-        for chunk in plan.chunks:
-            assert len(chunk.layer) <= 9 or chunk.extent == (1, 1, 1)
-            corner = chunk.pixels[0].start, chunk.pixels[1].start // down, chunk.pixels[2].start // (2 * across)
-            for pair, (block, layer) in enumerate(
-                zip(chunk.block.tolist(), plan.layers[chunk.layer].tolist(), strict=True)
-            ):
-                place = [int(n) for n in torch.unravel_index(torch.tensor(block), chunk.extent)]
-                key = tuple(start + n for start, n in zip(corner, place, strict=True))
-                found.setdefault(key, []).append(layer)
-                flat = (key[0] * grid.rows + key[1]) * grid.columns + key[2]
-                assert plan.number[flat, layer] == chunk.first + pair
-            numbers += [pair + chunk.first for _, own, _ in chunk.runs for pair in range(own.start, own.stop)]
-        assert numbers == list(range(sum(map(len, found.values()))))
-        for b, r, k in product(range(2), range(grid.rows), range(grid.columns)):
-            seen = label[b, r * down : (r + 1) * down + lost, k * 2 * across : (k + 1) * 2 * across + lost]
-            assert found[b, r, k] == seen.unique().tolist()
+        present = present_in_tiles(Labels(label, None), (12, 14), 6, reach).view(2, 4, 4, 6)
+        for b, r, k in product(range(2), range(4), range(4)):
+            seen = label[b, r * 12 : (r + 1) * 12 + reach, k * 14 : (k + 1) * 14 + reach]
+            assert present[b, r, k].nonzero()[:, 0].tolist() == seen.unique().tolist()
+
+    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    def test_feature_parts_hold_each_pixel_once_and_the_layers_around_it(self, compositing):
+        bank = make_bank(6, 3, 5)
+        image, defocus = make_scene(bank, 2, 130, 170)
+        scene = layered_scene(image, defocus, bank.defocus, bank.psfs, compositing=compositing)
+        index, weight = scene.sorted_layers
+        assert weight is not None
+        reach = 4 if compositing == "occlusion" else 0
+        counted = torch.zeros(2, 3, index.shape[-2] - reach, index.shape[-1] - reach)
+        for part in BatchedBackend(chunk_bytes=1 << 20).parts(scene):
+            counted[part.images, part.channels, part.rows, part.columns] += 1
+            held = part.window(index, reach).unique()
+            assert part.layers.tolist() == sorted({*held.tolist(), *(held + 1).tolist()} & {*range(6)})
+        assert bool((counted == 1).all())
 
     def test_feature_tiles_are_no_shorter_than_their_overlap_and_windows_no_larger_than_needed(self):
         for size in (1, 5, 23, 129, 257):
@@ -215,11 +215,9 @@ class TestPlan(BaseTester):
                 bank = make_bank(1, 1, size)
                 image, defocus = make_scene(bank, 1, height, width)
                 scene = layered_scene(image, defocus, bank.defocus, bank.psfs, border="replicate")
-                grid = BatchedBackend().grid(scene)
-                assert grid.shape == (height, width)
-                assert grid.rows <= 2 or grid.tile[0] >= size - 1
-                assert grid.columns <= 2 or 2 * grid.tile[1] >= size - 1
-                assert max(grid.size) <= max(64, 1.25 * 2.5 * size + 16)
+                for side, tile in zip((height, width), BatchedBackend().tile(scene), strict=True):
+                    assert -(-side // tile) <= 2 or tile >= size - 1
+                    assert tile + size - 1 <= max(80, 1.25 * 2.5 * size + 16)
 
 
 @pytest.fixture(params=["whole planes", "parts of them", "one block", "tiles"])

@@ -1,4 +1,4 @@
-r"""Occlusion of whole planes: all layers in one batch of transforms, for accelerators.
+r"""Occlusion in batches of transforms: all layers of a part of the scene at once.
 
 The planes of :mod:`kornia_tidy.render.backends.dense_occlusion`, laid over one another by a product over the layers
 instead of one after the other:
@@ -22,8 +22,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.precision import widest
-from kornia_tidy.render.backend import GradientPairs, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, gradient_pairs, wants_gradient
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, OcclusionPlanes, cumulative_weight
+from kornia_tidy.render.backends.layer_batches import Part
 from kornia_tidy.render.borders import from_spectrum, next_fast_size, to_spectrum
 from kornia_tidy.render.layers import weight_of_layer
 
@@ -37,7 +38,72 @@ class _Layers(NamedTuple):
     alphas: Tensor
 
 
-def occlude_whole(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
+def part_of(planes: OcclusionPlanes, part: Part) -> OcclusionPlanes:
+    """Return the planes that a part of the output is rendered from, with the layers in them."""
+    lost, layers = planes.psfs.shape[-1] - 1, len(planes.psfs)
+    weight, mean, stray, inside = planes.layer_weight, planes.mean, planes.stray_light, planes.inside
+    return OcclusionPlanes(
+        part.window(planes.light, lost),
+        part.chosen(planes.psfs),
+        None if weight is None else part.window(weight, lost),
+        None if mean is None else mean[part.images],
+        None if stray is None else part.chosen(stray),
+        part.numbered(part.window(planes.layer_index, lost), layers),
+        None if inside is None else part.window(inside, lost),
+    )
+
+
+def occlude_parts(planes: OcclusionPlanes, parts: list[Part], part_bytes: int) -> Tensor:
+    """Render parts with occlusion; the arguments and the result are those of :func:`occlude`."""
+    if len(parts) == 1 and parts[0].layers is None:
+        return occlude(planes, part_bytes)
+    lost = planes.psfs.shape[-1] - 1
+    height, width = (side - lost for side in planes.light.shape[-2:])
+    coded = planes.light.new_empty(*planes.light.shape[:2], height, width, dtype=_dtype(planes))
+    for part in parts:
+        coded[part.images, :, part.rows, part.columns] = occlude(part_of(planes, part), part_bytes)
+    return coded
+
+
+def part_gradients(planes: OcclusionPlanes, parts: list[Part], gradient: Tensor, part_bytes: int) -> GradientPairs:
+    """Return the gradients of the planes, each part's made and added where it belongs.
+
+    Args:
+        planes: of the scene.
+        parts: of the output.
+        gradient: (B, C, H, W) of the rendered light.
+        part_bytes: as for :func:`occlude`.
+    """
+    if len(parts) == 1 and parts[0].layers is None:
+        return gradients(planes, gradient, part_bytes)
+    lost = planes.psfs.shape[-1] - 1
+    totals = [torch.zeros_like(x) if x is not None and x.requires_grad else None for x in planes]
+    for part in parts:
+        given = part_of(planes, part)
+        own = given._replace(
+            **{
+                name: value.detach().requires_grad_()
+                for name, value, total in zip(planes._fields, given, totals, strict=True)
+                if total is not None and value is not None
+            }
+        )
+        pairs = gradients(own, part.window(gradient), part_bytes)
+        made, grads = zip(*pairs, strict=True)
+        leaves = [x for x, total in zip(own, totals, strict=True) if total is not None and x is not None]
+        found = iter(torch.autograd.grad(made, leaves, grads, allow_unused=True))
+        for name, total in zip(planes._fields, totals, strict=True):
+            if total is None or (value := next(found)) is None:
+                continue
+            if name in ("psfs", "stray_light"):
+                total.index_add_(0, part.layers, value) if part.layers is not None else total.add_(value)
+            elif name == "mean":
+                total[part.images] += value
+            else:
+                part.window(total, lost).add_(value)
+    return gradient_pairs(planes, totals)
+
+
+def occlude(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
     """Render with occlusion; the definition is :func:`~.dense_occlusion.occlude_dense`.
 
     Args:
@@ -59,13 +125,13 @@ def occlude_whole(planes: OcclusionPlanes, part_bytes: int) -> Tensor:
     return coded
 
 
-def whole_gradients(planes: OcclusionPlanes, gradient: Tensor, part_bytes: int) -> GradientPairs:
+def gradients(planes: OcclusionPlanes, gradient: Tensor, part_bytes: int) -> GradientPairs:
     """Return the gradients of light rendered with occlusion: of the PSFs, and of the layers' light and alpha.
 
     Args:
         planes: of the scene.
         gradient: (B, C, H, W) of the rendered light.
-        part_bytes: as for :func:`occlude_whole`.
+        part_bytes: as for :func:`occlude`.
     """
     size, side = (planes.light.shape[-2], planes.light.shape[-1]), planes.psfs.shape[-1]
     of_psfs = torch.zeros_like(planes.psfs) if wants_gradient(planes.psfs) else None
