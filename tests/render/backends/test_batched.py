@@ -194,7 +194,7 @@ class TestTiles(BaseTester):
             seen = label[b, r * 12 : (r + 1) * 12 + reach, k * 14 : (k + 1) * 14 + reach]
             assert present[b, r, k].nonzero()[:, 0].tolist() == seen.unique().tolist()
 
-    @pytest.mark.parametrize("compositing", COMPOSITINGS)
+    @over_compositing
     def test_feature_parts_hold_each_pixel_once_and_the_layers_around_it(self, compositing):
         bank = make_bank(6, 3, 5)
         image, defocus = make_scene(bank, 2, 130, 170)
