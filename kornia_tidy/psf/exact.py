@@ -88,30 +88,25 @@ def exact_psf_bank(
     geometry = (window, cells, pupil.cell_pitch, pupil.extent, tolerance)
     dtype = torch.complex128 if phase.dtype == torch.float64 else torch.complex64
 
-    def kernels_of(psi: Sequence[float], w: int, device: torch.device) -> Tensor:
-        scale = REFERENCE_WAVELENGTH / spectrum.wavelengths[w]
-        at = tuple((p + shifts[w]) * scale for p in psi)
-        return _kernels(at, pixel_step / spectrum.wavelengths[w], geometry, gaps, device, dtype, remember)
+    lens, waves = (pixel_step, geometry, gaps, dtype, remember), list(zip(spectrum.wavelengths, shifts, strict=True))
 
     if phase.device.type != "cpu" and not torch_mode() & Mode.TRACED and isinstance(pixel_step, float):
         columns = cells if gaps is None else 2 * cells
         if len(defocus) * len(spectrum.wavelengths) * window * columns**2 * dtype.itemsize // 2 <= _MOST_BYTES:
-            constants = spectrum.wavelengths, tuple(shifts), pixel_step, geometry, gaps, dtype, phase.device
 
             def matrices_of(nodes: tuple[float, ...]) -> tuple[Tensor, ...]:  # made on the CPU
-                made = energy_matrices([kernels_of(nodes, w, torch.device("cpu")) for w in range(len(shifts))])
+                made = energy_matrices([_kernels(nodes, *wave, *lens, torch.device("cpu")) for wave in waves])
                 return tuple(matrix.to(phase.device) for matrix in made)
 
-            left, pixels = MEMORY.recall(constants, tuple(defocus), matrices_of)
-            lens = pupil, tuple(dispersion), per_channel
+            left, pixels = MEMORY.recall(("matrices", *waves, *lens, phase.device), tuple(defocus), matrices_of)
             make = _constants_of.__wrapped__ if pupil.amplitude.requires_grad else _constants_of
-            scales, amplitude, share = make(*lens, phase.device, phase.dtype)
+            scales, amplitude, share = make(pupil, tuple(dispersion), per_channel, phase.device, phase.dtype)
             nodes = _nodes_of(tuple(defocus), phase.device, phase.dtype)
-            waves = field(phase, amplitude, scales)
+            light = field(phase, amplitude, scales)
             if each_state:  # in the place of more wavelengths
-                waves, weights = waves.transpose(0, 1).flatten(0, 1)[:, None], torch.ones_like(weights[:1])
+                light, weights = light.transpose(0, 1).flatten(0, 1)[:, None], torch.ones_like(weights[:1])
                 left, pixels = (x.repeat(1, len(phase), *[1] * (x.ndim - 2)) for x in (left, pixels))
-            energies = intensity_energies(waves, weights.to(phase.dtype), left, pixels)
+            energies = intensity_energies(light, weights.to(phase.dtype), left, pixels)
             by_state = energies.unflatten(1, (-1, len(share[0])))
             psfs = torch.einsum("dswyx,cw->dscyx", by_state, share).flatten(1, 2)
             return PSFBank(psfs, nodes, psfs.sum((2, 3)))
@@ -124,7 +119,7 @@ def exact_psf_bank(
 
     psfs = phase.new_zeros(len(defocus), len(per_channel), window, window)
     for w in range(len(spectrum.wavelengths)):
-        kernels = kernels_of(defocus, w, phase.device)
+        kernels = _kernels(defocus, *waves[w], *lens, phase.device)
         light = pixel_energies(field(phase, pupil.amplitude, dispersion[w]), weights, kernels)
         energies = light / pupil.light
         share = phase.new_tensor([channel[w] for channel in per_channel])
@@ -156,27 +151,27 @@ def _nodes_of(defocus: tuple[float, ...], device: torch.device, dtype: torch.dty
 
 
 def _kernels(
-    defocus: tuple[float, ...],
-    step: float | Tensor,
+    defocus: Sequence[float],
+    wavelength: float,
+    shift: float,
+    pixel_step: float | Tensor,
     geometry: Geometry,
     gaps: Gaps,
-    device: torch.device,
     dtype: torch.dtype,
     remember: bool,
+    device: torch.device,
 ) -> Tensor:
-    """Return the sensor kernels, remembered where the geometry is fixed: they depend on nothing else."""
-    spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
+    """Return the sensor kernels at a wavelength, remembered where the geometry is fixed."""
     if not has_float64(device):
-        cpu = torch.device("cpu")
-        step = step.to(cpu) if isinstance(step, Tensor) else step
-        return _kernels(defocus, step, geometry, gaps, cpu, dtype, remember).to(device)
+        step = pixel_step.cpu() if isinstance(pixel_step, Tensor) else pixel_step
+        return _kernels(defocus, wavelength, shift, step, geometry, gaps, dtype, remember, torch.device("cpu")).to(
+            device
+        )
+    spans = None if gaps is None else gapped_cells(geometry[1], *gaps)
+    at, step = tuple((p + shift) * (REFERENCE_WAVELENGTH / wavelength) for p in defocus), pixel_step / wavelength
     if isinstance(step, Tensor):  # a learnable focus sends its gradient through them
-        return sensor_kernels(defocus, step.double(), *geometry, device, spans).to(dtype)
+        return sensor_kernels(at, step.double(), *geometry, device, spans).to(dtype)
     if torch_mode() & Mode.TRACED or not remember:
-        return sensor_kernels(defocus, step, *geometry, device, spans).to(dtype)
-    parts = step, geometry, gaps, device, dtype, torch.get_num_threads()
-
-    def make(nodes: tuple[float, ...]) -> tuple[Tensor]:
-        return (sensor_kernels(nodes, step, *geometry, device, spans).to(dtype),)
-
-    return MEMORY.recall(parts, defocus, make)[0]
+        return sensor_kernels(at, step, *geometry, device, spans).to(dtype)
+    key = "kernels", step, geometry, gaps, device, dtype, torch.get_num_threads()
+    return MEMORY.recall(key, at, lambda psi: (sensor_kernels(psi, step, *geometry, device, spans).to(dtype),))[0]

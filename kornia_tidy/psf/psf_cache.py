@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -20,18 +20,18 @@ _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among th
 class _Remembered:
     """Tensors of some depths, and what was made of those that were asked for last."""
 
-    defocus: tuple[float, ...]
-    tensors: tuple[Tensor, ...]
-    asked: tuple[float, ...]
-    formed: Any
-    nbytes: int
+    defocus: tuple[float, ...] = ()
+    tensors: tuple[Tensor, ...] = ()
+    asked: tuple[tuple[float, ...], Hashable] | None = None
+    formed: Any = None
+    nbytes: int = 0
 
 
 class PSFMemory:
     """Tensors of each depth, such as PSFs, by all that they depend on: of those used last so many bytes.
 
-    Parts are compared by value, so tensors that no longer hold are never given out, however masks and lens were
-    changed. Any number of threads may ask at once; those that meet on their first capture may each compute the same.
+    Keys are values, so tensors that no longer hold are never given out, however masks and lens were changed. Any number
+    of threads may ask at once; those that meet on their first capture may each compute the same.
 
     Args:
         most_bytes: of all tensors together. What is larger is computed anew each time.
@@ -43,7 +43,7 @@ class PSFMemory:
         ...     return (torch.tensor(nodes),)
         >>> memory, masks = PSFMemory(), torch.zeros(1, 4, 4)
         >>> for nodes in ((0.0, 1.0), (1.0, 2.0), (0.0, 2.0)):
-        ...     (psfs,) = memory.recall(["grey", masks], nodes, make)
+        ...     (psfs,) = memory.recall(values_of("grey", masks), nodes, make)
         >>> asked
         [(0.0, 1.0), (2.0,)]
     """
@@ -54,28 +54,40 @@ class PSFMemory:
 
     def recall(
         self,
-        parts: Sequence[object],
+        key: Hashable,
         defocus: tuple[float, ...],
         make: Callable[[tuple[float, ...]], tuple[Tensor, ...]],
-        form: Callable[..., Any] = lambda *tensors: tensors,
+        form: Callable[..., Any] | None = None,
+        how: Hashable = None,
     ) -> Any:
         """Return tensors for these depths; only those of depths that are not remembered are computed.
 
         They may be given out again, so they must not be changed.
 
         Args:
-            parts: all that they depend on besides depth. Tensors are compared by value; of a module it must be the same
-                one with the same types and plain attributes, in it and its submodules.
+            key: all that they depend on besides depth, see :func:`values_of`.
             defocus: depths in radians, ascending.
             make: computes the tensors of some depths, each with an axis of depths first.
-            form: what to return, made of the tensors. Default: a tuple.
+            form: what to return, made of the tensors. Default: a tuple of them.
+            how: tells apart what was made of the same tensors.
         """
         with torch.inference_mode(False), torch.no_grad():  # what is remembered serves in training too
-            key = tuple(_values(parts))
-            known = self._held.pop(key, None)
-            if known is None or known.asked != defocus:
-                known = _with_depths(known, defocus, make, form)
-                held = known.nbytes + sum(own.nbytes for own in list(self._held.values()))
+            known = self._held.pop(key, None) or _Remembered()
+            if known.asked != (defocus, how):
+                nodes, tensors = known.defocus, known.tensors
+                if missing := tuple(sorted({*defocus} - {*nodes})):
+                    made = tuple(tensor.contiguous() for tensor in make(missing))
+                    tensors = tuple(map(torch.cat, zip(tensors, made, strict=True))) if tensors else made
+                    nodes += missing
+                # Sums are rounded in an order that follows the layout: it is the same whatever is remembered.
+                places = [nodes.index(psi) for psi in defocus]
+                found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
+                of_found = sum(tensor.nbytes for tensor in found)  # what is made of them takes as much again
+                nbytes = (
+                    sum(tensor.nbytes for tensor in tensors) + ((found is not tensors) + (form is not None)) * of_found
+                )
+                known = _Remembered(nodes, tensors, (defocus, how), form(*found) if form else found, nbytes)
+                held = nbytes + sum(own.nbytes for own in list(self._held.values()))
                 for oldest in list(self._held):
                     if held > self.most_bytes and (own := self._held.pop(oldest, None)) is not None:
                         held -= own.nbytes
@@ -88,40 +100,31 @@ MEMORY = PSFMemory()
 """The memory of all cameras of the process."""
 
 
-def _values(parts: Sequence[object]) -> Iterator[Hashable]:
+def values_of(*parts: object) -> tuple[Hashable, ...]:
+    """Return what tells tensors and modules apart: tensors by value; modules by themselves and their plain attributes.
+
+    Example:
+        >>> from kornia_tidy.modulator.modulator import DwellTimes
+        >>> values_of(DwellTimes((3, 1)))[1:]
+        (<class 'kornia_tidy.modulator.modulator.DwellTimes'>, 'shares', (0.75, 0.25))
+        >>> values_of(torch.zeros(2)) == values_of(torch.zeros(2)) != values_of(torch.ones(2))
+        True
+    """
+    found: list[Hashable] = []
     for part in parts:
         if isinstance(part, Tensor):
-            yield part.dtype, part.device, tuple(part.shape), part.detach().cpu().numpy().tobytes()
+            found += part.dtype, part.device, tuple(part.shape), part.detach().cpu().numpy().tobytes()
         elif isinstance(part, nn.Module):
-            yield weakref.ref(part)
+            found.append(weakref.ref(part))
             for module in part.modules():
-                yield type(module)
+                found.append(type(module))
                 for name, value in vars(module).items():
                     if name not in _OF_EVERY_MODULE:
                         plain = value.tolist() if hasattr(value, "tolist") else value
-                        yield name
-                        yield repr(plain) if isinstance(plain, (list, dict, set)) else plain
+                        found += name, repr(plain) if isinstance(plain, (list, dict, set)) else plain
         else:
-            yield cast("Hashable", part)
-
-
-def _with_depths(
-    known: _Remembered | None,
-    defocus: tuple[float, ...],
-    make: Callable[[tuple[float, ...]], tuple[Tensor, ...]],
-    form: Callable[..., Any],
-) -> _Remembered:
-    """Return what is known, with tensors of these depths too."""
-    nodes, tensors = ((), ()) if known is None else (known.defocus, known.tensors)
-    if missing := tuple(sorted({*defocus} - {*nodes})):
-        made = tuple(tensor.contiguous() for tensor in make(missing))
-        tensors = tuple(map(torch.cat, zip(tensors, made, strict=True))) if tensors else made
-        nodes = nodes + missing
-    # Sums are rounded in an order that follows the layout, so what comes out is laid out alike whatever is remembered.
-    places = [nodes.index(psi) for psi in defocus]
-    found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
-    nbytes = sum(tensor.nbytes for tensor in (*tensors, *(() if found is tensors else found)))
-    return _Remembered(nodes, tensors, defocus, form(*found), nbytes)
+            found.append(cast("Hashable", part))
+    return tuple(found)
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:

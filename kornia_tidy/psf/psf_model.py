@@ -39,7 +39,7 @@ from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import MEMORY, nodes_around
+from kornia_tidy.psf.psf_cache import MEMORY, nodes_around, values_of
 from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
 from kornia_tidy.psf.pupil import Pupil, pupil_over
@@ -308,7 +308,7 @@ class PSFModel:
 
         parts = "light", passed, pupil.cell_pitch, flat, field.points, lens.table, pitch, torch.get_num_threads()
         new = passed.requires_grad or torch_mode() & Mode.TRACED or not self._remembers
-        (light,) = light_at(nodes) if new else MEMORY.recall(parts, nodes, light_at)
+        (light,) = light_at(nodes) if new else MEMORY.recall(values_of(*parts), nodes, light_at)
         light = light.to(bank.psfs)
         light = light.repeat_interleave(bank.psfs.shape[1] // light[0].numel(), 2)  # (D, F, C)
         psfs, energy = (own.unflatten(1, (-1, light.shape[-1])) for own in (bank.psfs, bank.energy))
@@ -398,40 +398,25 @@ class PSFModel:
             lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
 
-        def finished(nodes: tuple[float, ...]) -> PSFBank | FieldBank:
-            bank = build(nodes) if stray_light is None else build(nodes).with_stray_light(*stray_light)
+        def finished(bank: PSFBank) -> PSFBank | FieldBank:
+            bank = bank if stray_light is None else bank.with_stray_light(*stray_light)
             return bank if field is None or stray_light is None else self._lit(bank, spectrum, field)
 
         unread = Mode.UNREAD in torch_mode()
         if not self._remembers or learning or traced or unread or next(self.camera.parameters(), None) is not None:
-            return finished(nodes)
-        points = None if field is None else field.points
-        over = points is not None and stray_light is not None
-        names = [
-            "psfs",
-            "energy",
-            *["light"] * over,
-            *["veil"] * (stray_light is not None and stray_light[0] == "veil"),
-        ]
-
-        def tensors_of(nodes: tuple[float, ...]) -> tuple[Tensor, ...]:  # with depths first
-            bank = finished(nodes)
-            return bank.defocus, *(getattr(bank, name).movedim(int(over), 0) for name in names)
-
-        def bank_of(defocus: Tensor, *tensors: Tensor) -> PSFBank | FieldBank:
-            own = {name: tensor.movedim(0, int(over)) for name, tensor in zip(names, tensors, strict=True)}
-            return (
-                FieldBank(defocus=defocus, field=defocus.new_tensor(points), **own)
-                if over
-                else PSFBank(defocus=defocus, **own)
-            )
-
+            return finished(build(nodes))
         # Sums of another number of threads are rounded in another order.
-        parts = spectrum, side, grid, each_state, stray_light, points
+        parts = "PSFs", spectrum, side, grid, each_state, None if field is None else field.points
         lens = self.fidelity, self._aperture_mark, getattr(self.modulator, "fill_factor", 1.0)
-        table, threads = None if self.lens is None else self.lens.table, torch.get_num_threads()
+        others = None if self.lens is None else self.lens.table, torch.get_num_threads()
         seen = states, weights, amplitude, self.masks, self.camera, *self.camera.buffers()
-        return MEMORY.recall((*parts, *lens, table, threads, *seen), nodes, tensors_of, bank_of)
+        return MEMORY.recall(
+            values_of(*parts, *lens, *others, *seen),
+            nodes,
+            lambda missing: (build(missing).psfs,),
+            lambda psfs: finished(PSFBank(psfs, psfs.new_tensor(nodes), psfs.sum((2, 3)))),
+            stray_light,
+        )
 
     def _exact_psfs(
         self,

@@ -17,7 +17,7 @@ from kornia_tidy.mode import recording_in_operator
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.psf.psf_cache import MEMORY
+from kornia_tidy.psf.psf_cache import MEMORY, values_of
 from kornia_tidy.psf.pupil import Pupil
 
 _LENS = (
@@ -91,7 +91,7 @@ def _psfs(*arguments: Any) -> Tensor:
         return (_computed(*arguments[:-4], missing, step, window, tolerance),)
 
     with torch.autocast(arguments[0].device.type, enabled=False):
-        return MEMORY.recall((*shown, *parts), tuple(nodes), make)[0].clone()
+        return MEMORY.recall(values_of("operator", *shown, *parts), tuple(nodes), make)[0].clone()
 
 
 def _shape(*arguments: Any) -> tuple[int, ...]:

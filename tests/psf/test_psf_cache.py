@@ -137,9 +137,9 @@ class TestPSFMemory(BaseTester):
             return (torch.zeros(len(nodes), 5, dtype=torch.float64),)
 
         for kind in ("one", "two", "three", "one", "four", "one", "two"):
-            memory.recall([kind], (0.0,), make)
+            memory.recall(kind, (0.0,), make)
         assert len(asked) == 5  # "two" again
-        memory.recall(["five"], (0.0, 1.0, 2.0, 3.0), make)
+        memory.recall("five", (0.0, 1.0, 2.0, 3.0), make)
         assert not memory._held  # larger than all that may be kept
 
     def test_feature_what_comes_out_does_not_depend_on_what_is_remembered(self):
@@ -148,12 +148,12 @@ class TestPSFMemory(BaseTester):
 
         memory = PSFMemory()
         for nodes in ((1.0,), (0.0, 2.0), (0.0, 1.0, 2.0, 3.0), (0.0, 3.0)):
-            (found,) = memory.recall([], nodes, make)
+            (found,) = memory.recall((), nodes, make)
             assert found.tolist() == [[psi] * 3 for psi in nodes]
             assert found.is_contiguous()
 
     def test_exception_nothing_is_kept_of_what_could_not_be_made(self):
         memory = PSFMemory()
         with pytest.raises(ZeroDivisionError):
-            memory.recall(["one"], (0.0,), lambda _: (torch.ones(1) * (1 // 0),))
+            memory.recall("one", (0.0,), lambda _: (torch.ones(1) * (1 // 0),))
         assert not memory._held
