@@ -111,6 +111,7 @@ EXEMPT = {
     "DepthMap": ({"feature", "exception"}, RECORD),
     "FrameTime": ({"feature", "exception"}, RECORD),
     "JointEstimate": ({"feature", "exception"}, RECORD),
+    "MaskFit": ({"exception"}, RECORD),
     "PointReport": ({"exception"}, RECORD),
     "RenderPlan": ({"feature", "exception"}, RECORD),
     "ResolvedPSF": ({"feature", "exception"}, RECORD),

@@ -1,4 +1,4 @@
-"""Figure of measured PSFs over depth, with their uncertainty."""
+"""Figure of measured PSFs over depth, with their uncertainty and the residuals of a fitted mask."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from kornia_tidy.figures.style import (
     GREEN,
     INK,
     LABEL,
+    PHASE_COLORS,
     RED,
     SMALL,
     TITLE,
     require_matplotlib,
 )
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,11 +33,12 @@ CELL = 1.25  # inches
 CHANNELS = {1: ("",), 3: (RED, GREEN, BLUE)}
 
 
-def draw_measured(measured: MeasuredPSFs) -> Figure:
-    """Draw measured PSFs over distance, with their uncertainty.
+def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
+    """Draw measured PSFs over distance, with their uncertainty, the fitted PSFs and the residuals of the fit.
 
     Args:
         measured: the PSFs.
+        fit: the retrieved mask, or None.
 
     Returns:
         A figure; ``figure.savefig(path, dpi=150)``.
@@ -46,8 +49,8 @@ def draw_measured(measured: MeasuredPSFs) -> Figure:
     Convention:
         - Far is left. PSFs are drawn with the square root of their light, each scaled to its brightest value; colour
           where there are three channels, else their mean.
-        - The uncertainty is the mean over the channels, in units of the PSF's brightest value. It has one scale, which
-          is written beside it.
+        - Uncertainty and residual are means over the channels, in units of the PSF's brightest value. Each row has one
+          scale, which is written beside it.
     """
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -61,6 +64,9 @@ def draw_measured(measured: MeasuredPSFs) -> Figure:
         ("measured", psfs, None),
         ("uncertainty,\none standard deviation", relative, float(relative.max())),
     ]
+    if fit is not None:
+        left = (psfs - fit.psfs.cpu()).mean(1) / peak
+        rows += [("the fitted mask's", fit.psfs.cpu(), None), ("measured less fitted", left, float(left.abs().max()))]
     width, height = max(7.5, CELL * (len(columns) + 1.6)), CELL * (len(rows) + 0.5) + 2.2
     figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(CELL * (len(rows) + 0.5), 2.2))
@@ -72,17 +78,20 @@ def draw_measured(measured: MeasuredPSFs) -> Figure:
             if number == 0:
                 title = f"{float(measured.distances[d]):.3g} m\nψ = {float(measured.bank.defocus[d]):+.1f}"
                 axes.set_title(title, fontsize=LABEL, color=INK)
-        words = name if scale is None else f"{name}\n(scale {scale:.1%})"
+        words = name if scale is None else f"{name}\n(scale {'±' if float(values.min()) < 0 else ''}{scale:.1%})"
         line[0].set_ylabel(words, fontsize=LABEL, color=FAINT, rotation=0, ha="right", va="center")
-    charts = below.subplots(1, 2)
-    _noise_chart(charts[0], measured)
+    charts = below.subplots(1, 2 if fit is None else 3, width_ratios=(2, 2) if fit is None else (2, 2, 1))
+    _noise_chart(charts[0], measured, fit)
     _misfit_chart(charts[1], measured)
+    if fit is not None:
+        _mask(charts[2], fit)
     return figure
 
 
 def _cell(axes: Axes, values: Tensor, scale: float | None) -> None:
     if scale is not None:
-        axes.imshow(values.numpy(), cmap="magma", vmin=0, vmax=scale, interpolation="nearest")
+        low = -scale if float(values.min()) < 0 else 0.0
+        axes.imshow(values.numpy(), cmap="RdBu_r" if low else "magma", vmin=low, vmax=scale, interpolation="nearest")
     else:
         light = (values / values.max().clamp(min=1e-30)).clamp(min=0).sqrt()
         if len(light) == 3:
@@ -92,14 +101,18 @@ def _cell(axes: Axes, values: Tensor, scale: float | None) -> None:
     axes.set(xticks=[], yticks=[])
 
 
-def _noise_chart(axes: Axes, measured: MeasuredPSFs) -> None:
-    """Chart the relative L1 difference over distance: expected from the noise."""
+def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> None:
+    """Chart the relative L1 difference over distance: expected from the noise, and left by the fit."""
     expected = math.sqrt(2 / math.pi) * measured.uncertainty.cpu().sum((2, 3))
     colors = CHANNELS.get(expected.shape[1], tuple(f"C{c}" for c in range(expected.shape[1])))
     for c, color in enumerate(colors):
         ink = color or INK
         axes.plot(measured.bank.defocus.cpu(), 100 * expected[:, c], "o-", color=ink, markersize=3, linewidth=1)
-    axes.set_title("relative L1 of the noise, %", fontsize=TITLE, color=INK)
+        if fit is not None:
+            left = 100 * fit.residual[:, c].cpu()
+            axes.plot(measured.bank.defocus.cpu(), left, "s:", color=ink, markersize=3, linewidth=1)
+    words = "relative L1, %: noise (solid)" + ("" if fit is None else ",\nleft by the fit (dotted)")
+    axes.set_title(words, fontsize=TITLE, color=INK)
     axes.set_ylim(bottom=0)
     axes.set_xlabel("defocus ψ, rad", fontsize=LABEL)
     axes.tick_params(labelsize=SMALL)
@@ -116,3 +129,10 @@ def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("point image, far to near", fontsize=LABEL)
     axes.tick_params(labelsize=SMALL)
+
+
+def _mask(axes: Axes, fit: MaskFit) -> None:
+    phase = fit.lens.masks.phase.detach().cpu()[0].remainder(2 * math.pi)
+    axes.imshow(phase.numpy(), cmap=PHASE_COLORS, vmin=0, vmax=2 * math.pi, interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+    axes.set_title("mask\nfound", fontsize=TITLE)

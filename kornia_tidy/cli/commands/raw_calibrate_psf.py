@@ -42,6 +42,8 @@ class CalibratePsf:
         window: side of the PSFs in pixels of the sensor.
         points: points in each picture.
         picture: draw PSFs, uncertainties and residuals. None: they are not drawn.
+        fit_mask: find the mask behind the PSFs and write its heights in metres. None: it is not searched for.
+        mask_size: pixels along a side of the mask that is fitted.
         diameter: of the point of light.
         sensor: its noise.
         lens: of the camera; its depths are the distances.
@@ -56,13 +58,15 @@ class CalibratePsf:
     window: Window = 41
     points: Count = 1
     picture: Annotated[str, Unit("PNG")] | None = None
+    fit_mask: Annotated[str, Unit("NPY")] | None = None
+    mask_size: Count = 23
     diameter: Annotated[float, Unit("M", "metres", 0)] = 0.0
     sensor: SensorInElectrons = field(default_factory=SensorInElectrons)
     lens: Annotated[dict[str, Any], Given(LensSettings, but=("depth_range",))] = field(default_factory=dict)
     dump: Dump = field(default_factory=Dump)
 
     basic: ClassVar = (
-        *("files", "distances", "output", "exposures", "reference", "window", "points", "picture", "noise"),
+        *("files", "distances", "output", "exposures", "reference", "window", "points", "picture", "fit_mask", "noise"),
         *("full_well", "read_noise", "focal_length", "f_number", "focus_distance", "pixel_pitch"),
     )
     notes: ClassVar = """\
@@ -86,10 +90,10 @@ In Python:
         --distances 0.35 0.6 1.5 --noise iso800.json -o bank.safetensors
 
   Two exposures at each position; the same positions with a flat modulator, which give
-  the position of the chief ray; and a picture of the PSFs:
+  the position of the chief ray; and retrieval of the mask behind these PSFs:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
         --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \\
-        --picture bank.png
+        --picture bank.png --fit-mask mask.npy
 """
 
     def run(self) -> None:
@@ -124,11 +128,22 @@ In Python:
         tell(
             "wrote", f"{self.output}, PSFs sum to one: light outside their {self.window} x {self.window} px is not seen"
         )
+        fit = None
+        if self.fit_mask is not None:
+            from kornia_tidy.lab.calibration.psf.phase_retrieval import retrieve_mask, spectrum_of
+            from kornia_tidy.lab.mask_export.mask_files import write_heights
+
+            fit = retrieve_mask(measured.bank, camera, spectrum_of(channels), self.mask_size)
+            for distance, left in zip(measured.distances, fit.residual, strict=True):
+                words = " ".join(f"{100 * float(x):.2g}" for x in left)
+                tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
+            write_heights(self.fit_mask, fit.lens.masks.heights().detach())
+            tell("wrote", self.fit_mask)
         if self.picture is not None:
             from kornia_tidy.figures.measured_psfs import draw_measured
             from kornia_tidy.figures.style import save_figure
 
-            save_figure(self.picture, draw_measured(measured))
+            save_figure(self.picture, draw_measured(measured, fit))
             tell("wrote", self.picture)
 
     def _check(self) -> None:
@@ -136,11 +151,11 @@ In Python:
         from kornia_tidy.checks import check_choice
         from kornia_tidy.files import check_file
 
-        for path, suffix in ((self.output, ".safetensors"), (self.picture, ".png")):
+        for path, suffix in ((self.output, ".safetensors"), (self.picture, ".png"), (self.fit_mask, ".npy")):
             if path is not None:
                 check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
         inputs = [*self.files, *self.reference]
-        check_outputs([self.output, self.picture], inputs)
+        check_outputs([self.output, self.picture, self.fit_mask], inputs)
         if len(set(self.distances)) != len(self.distances) or not min(self.distances) > 0:
             raise ValueError(f"--distances must be different metres above zero, got {self.distances}")
         groups = len(self.distances) * len(self.exposures)
@@ -152,6 +167,8 @@ In Python:
         places = len(self.files) // groups
         for path in inputs:
             check_file(path)
+        if self.fit_mask is not None and len(self.distances) < 2:
+            raise ValueError("--fit-mask needs two distances or more: one does not tell a mask from its twin")
         if self.reference and len(self.reference) != places * len(self.distances):
             raise ValueError(
                 f"--reference needs one file for each of {places * len(self.distances)} places, got "
