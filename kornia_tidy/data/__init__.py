@@ -20,6 +20,7 @@ from kornia_tidy.data.rgbd_folder import RGBDFolder, described_folder
 from kornia_tidy.data.sample_scenes import sample_scene
 from kornia_tidy.data.scene_dataset import SceneDataset, UnreadableItemError
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
+from kornia_tidy.data.statistics_measurement import measured_statistics
 from kornia_tidy.data.sun_rgbd import SUNRGBD
 from kornia_tidy.data.tum_sequence import TUMSequence
 from kornia_tidy.optics.holes import fill_holes
@@ -47,6 +48,7 @@ __all__ = [
     "fill_holes",
     "hypersim",
     "kitti",
+    "measured_statistics",
     "middlebury",
     "paper_patches",
     "photo_collage",

@@ -14,7 +14,7 @@ from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from kornia_tidy.figures.depth import draw_depth
 from kornia_tidy.figures.style import require_matplotlib, save_figure
-from kornia_tidy.files import remove_leftovers, write_bytes
+from kornia_tidy.files import parse_json, remove_leftovers, write_bytes
 from kornia_tidy.lab.capture_file import CaptureLight
 from kornia_tidy.lab.file_jobs import Row, output_paths, work_on_all
 from kornia_tidy.reconstruction.light_head import (
@@ -112,6 +112,7 @@ def reconstruct_files(
     read: Callable[[str], CaptureLight],
     *,
     words: Mapping[str, Any] | None = None,
+    inputs: Sequence[str] = (),
     resume: bool = False,
     picture: str = ".png",
     depth_unit: float = 1e-3,
@@ -126,8 +127,9 @@ def reconstruct_files(
             made if missing.
         head: the network.
         read: from a file to its light, such as :func:`~kornia_tidy.lab.capture_file.read_light`.
-        words: more for the JSON files.
-        resume: keep results that are complete, whatever they were made with.
+        words: settings, for the JSON files.
+        inputs: files that the results depend on beside the captures, such as a checkpoint.
+        resume: keep results that are complete, of the same files and ``words``.
         picture: suffix of the picture of 16 bits.
         depth_unit: metres of a unit of depth in PNG files.
         memory_budget: bytes for the network's tiles.
@@ -149,17 +151,37 @@ def reconstruct_files(
 
     def work(path: str, progress: Callable[[int, int], None]) -> Row:
         start, paths = time.perf_counter(), outputs[path]
-        if resume and all(each.is_file() for each in paths):
+        made_of = {"source": _identity(path), "inputs": [_identity(each) for each in inputs], **(words or {})}
+        made_of = json.loads(json.dumps(made_of))
+        if resume and _is_finished(paths, made_of):
             return Row(path, "kept")
         capture = read(path)
         options: dict[str, Any] = {"memory_budget": memory_budget, "overlap": overlap, "progress": progress}
         own = with_noise_of(head, capture.noise)
         result, capture = reconstruct_light(own, capture.light, **options), capture._replace(light=torch.empty(0))
         size = write_reconstruction(paths[:-1], result, capture, head, depth_unit)
-        record = {"source": Path(path).name, "size": size, **(words or {}), **reconstruction_in_words(head, depth_unit)}
+        record = {**made_of, "size": size, **reconstruction_in_words(head, depth_unit)}
         record |= {"notes": list(result.notes)} if result.notes else {}
         record |= {"noise": capture.noise.extra_repr()} if capture.noise is not None else {}
         write_bytes(paths[-1], (json.dumps(record, indent=1) + "\n").encode())
         return Row(path, "done", f"{size[0]} x {size[1]}", time.perf_counter() - start, result.notes)
 
     return work_on_all("reconstruct", list(outputs), work)
+
+
+def _is_finished(paths: Sequence[Path], made_of: Mapping[str, Any]) -> bool:
+    """Return whether all results of a file exist, made of the same files with the same settings."""
+    try:
+        record = parse_json(paths[-1].read_bytes())
+    except (OSError, ValueError):
+        return False
+    same = isinstance(record, dict) and all(record.get(name) == value for name, value in made_of.items())
+    return same and all(path.is_file() for path in paths)
+
+
+def _identity(path: str) -> dict[str, Any]:
+    """Return the identity of an input file."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"cannot read {path}: there is no such file")
+    state = Path(path).stat()
+    return {"file": Path(path).name, "bytes": state.st_size, "modified": state.st_mtime_ns}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.data.patches import central_crop
-from tests.benchmarks.statistics_measurement import linear_light, measured_statistics, radial_spectrum
+from kornia_tidy.data.statistics_measurement import linear_light, measured_statistics, radial_spectrum
 from tests.scenes import ENTRIES, halves, load_scene
 
 LARGEST = 512  # pixels; of real scenes the middle

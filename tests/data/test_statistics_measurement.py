@@ -6,17 +6,16 @@ import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb
 
-from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics
-from tests.base import BaseTester, needs_data
-from tests.benchmarks.statistics_measurement import (
+from kornia_tidy.data import PHOTOGRAPHS, SceneStatistics, measured_statistics
+from kornia_tidy.data.statistics_measurement import (
     LOWEST,
     depth_shares,
     fitted_power_law,
     fitted_shade,
     linear_light,
-    measured_statistics,
     radial_spectrum,
 )
+from tests.base import BaseTester, needs_data
 
 
 def pictures(scenes, count=4, size=192, seed=0):

@@ -68,7 +68,7 @@ class ReconstructRaw:
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
-        resume: skip files whose results are complete, whatever they were made with.
+        resume: skip files whose results are complete, made of the same files with the same settings.
         format: of the 16-bit picture.
         depth_unit: of FILE_depth.png.
         linear: FILES that are pictures hold linear light, not sRGB.
@@ -178,9 +178,13 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
                 check_capture(system, path, capture)
             return capture
 
-        words = {"head": self.head or ANY_CAMERA} | ({"psfs": f"measured: {self.psfs}"} if self.psfs else {})
+        words: dict[str, Any] = {"head": self.head or ANY_CAMERA} | (
+            {"psfs": f"measured: {self.psfs}"} if self.psfs else {}
+        )
         words |= {name: str(value) for name, value in self._given().items()}
-        words |= {name: getattr(self, name) for name in ("linear", "overlap", "orientations", "white_balance")}
+        settings = ("noise", "linear", "overlap", "orientations", "white_balance", "depth_unit")
+        words["settings"] = {name: getattr(self, name) for name in settings} | {"dump": vars(self.dump)}
+        used = (self.head, self.psfs, self.noise, self.masks, self.lens)
         folder = Path(self.output)
         rows = reconstruct_files(
             self.files,
@@ -188,6 +192,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             head,
             read,
             words=words,
+            inputs=[each for each in used if isinstance(each, str) and Path(each).is_file()],
             resume=self.resume,
             picture=SUFFIXES[self.format],
             depth_unit=self.depth_unit,

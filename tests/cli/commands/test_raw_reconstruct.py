@@ -133,7 +133,7 @@ class TestRawReconstruct(BaseTester):
         alone, averaged = (reconstruct_light(LightHead(system, None, n), read_image(file)).image for n in (1, 4))
         assert (found - averaged).abs().max() <= 0.5 / 65535 + 1e-7
         assert (found - alone).abs().max() > 1e-3
-        assert json.loads((folder / "a.json").read_text())["orientations"] == 4
+        assert json.loads((folder / "a.json").read_text())["settings"]["orientations"] == 4
         other = checkpoint(tmp_path / "other.safetensors", task="edof")
         assert reconstruct([file], other, folder, "--orientations", "4") == 2
         assert "is for a network that begins with the closed form" in capsys.readouterr().err
@@ -207,15 +207,24 @@ class TestRawReconstruct(BaseTester):
         assert "kept" in capsys.readouterr().out
         assert contents(folder) == contents(folder.with_name("whole"))
 
-    @pytest.mark.parametrize("missing", ["a.json", "a_depth.pfm", None])
-    def test_feature_resume_keeps_what_is_complete(self, batch, missing, capsys):
+    @pytest.mark.parametrize("change", ["checkpoint", "file", "option", "missing", "record", "none"])
+    def test_feature_resume_keeps_only_what_is_still_right(self, batch, change, capsys):
         files, weights, folder = batch
         assert reconstruct(files[:1], weights, folder) == 0
-        if missing:
-            (folder / missing).unlink()
+        options = ["--resume"]
+        if change == "checkpoint":
+            checkpoint(weights, seed=1, task="joint")
+        elif change == "file":
+            capture(files[0], seed=9)
+        elif change == "option":
+            options += ["--depth-unit", "0.002"]
+        elif change == "missing":
+            (folder / "a_depth.pfm").unlink()
+        elif change == "record":
+            (folder / "a.json").write_text("{")
         capsys.readouterr()
-        assert reconstruct(files[:1], weights, folder, "--resume") == 0
-        assert ("kept" in capsys.readouterr().out) == (missing is None)
+        assert reconstruct(files[:1], weights, folder, *options) == 0
+        assert ("kept" in capsys.readouterr().out) == (change == "none")
         assert (folder / "a_depth.pfm").exists()
 
     @pytest.mark.takes_seconds
