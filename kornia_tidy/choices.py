@@ -40,8 +40,8 @@ DEMOSAIC = (
 )  # fmt: skip
 WHITE_BALANCES = ("as shot", "daylight", "auto", "none")
 HIGHLIGHTS = ("clip", "keep")
-PRETRAINED = ("joint-uncertain", "edof-5", "edof-1", "edof-designed", "edof-flat")
-"""Shipped systems: task and number of masks. ``"edof-5"`` and ``"edof-1"`` have the paper's lens of f/17.6. The
+PRETRAINED = ("joint-uncertain", "edof-5", "edof-designed", "edof-flat")
+"""Shipped systems: task and number of masks. ``"edof-5"`` has the paper's lens of f/17.6. The
 networks of ``"edof-designed"``, five masks of 92 x 92 pixels at f/22, and of ``"edof-flat"``, none at f/48, know light
 of 500 to 57,000 electrons of white at f/17.6 in the same exposure time. ``"joint-uncertain"`` has five masks at f/28.5,
 designed for image and depth, and a network that begins with the closed form: it returns a distribution of depth, so
@@ -50,6 +50,7 @@ REPLACED = {
     "joint-5": "joint-uncertain",
     "joint-1": "joint-uncertain",
     "joint-0": "joint-uncertain",
+    "edof-1": "any-camera",
     "edof-0": "edof-flat",
 }
 """Systems of earlier versions, and what took the place of each."""

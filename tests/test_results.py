@@ -105,7 +105,7 @@ class TestSystems(BaseTester):
     def test_feature_other_weights_are_another_system(self):
         makers = available()
         assert makers[FLAT]().digest == makers[FLAT]().digest != makers["flat f/60"]().digest
-        trained = load_pretrained("edof-1")
+        trained = load_pretrained("edof-flat")
         before = of_trained("a", trained).digest
         with torch.no_grad():
             next(trained.head.parameters()).add_(1.0)

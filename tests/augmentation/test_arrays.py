@@ -168,7 +168,7 @@ class TestReconstruct(BaseTester):
 
     @pytest.mark.takes_seconds
     def test_feature_a_system_without_depth(self):
-        image, depth = kornia_tidy.reconstruct(picture("uint8", 32, 48, 3), load_pretrained("edof-1"))
+        image, depth = kornia_tidy.reconstruct(picture("uint8", 32, 48, 3), load_pretrained("edof-flat"))
         assert depth is None
         assert image.shape == (32, 48, 3)
 

@@ -104,8 +104,8 @@ class TestPretrained(BaseTester):
             assert torch.equal(system.head(capture), expected)
 
     def test_feature_networks_are_shipped_in_eight_bits_and_loaded_in_single(self, tmp_path):
-        whole = load_trained(FOLDER / "edof-1.safetensors")
-        ship(FOLDER / "edof-1.safetensors", tmp_path / "short.safetensors")
+        whole = load_trained(FOLDER / "edof-flat.safetensors")
+        ship(FOLDER / "edof-flat.safetensors", tmp_path / "short.safetensors")
         weights = list(whole.head.parameters())
         count, channels = sum(weight.numel() for weight in weights), sum(len(weight) for weight in weights)
         others = sum(value.numel() for part in whole[:2] for value in part.state_dict().values()) - count

@@ -113,7 +113,7 @@ its masks with its lens.
 One network, any-camera, restores the captures of any camera that it is told. All others fit
 the camera that they were trained with, its masks and its lens. The library includes, for a
 50 mm lens and pixels of 8 um
-  edof-5, edof-1              picture: five masks, one; f/17.6, at 0.6 m
+  edof-5                      picture: five masks; f/17.6, at 0.6 m
   edof-designed               picture: five masks; f/22, at 1.98 m
   edof-flat                   picture: no masks; f/48, at 0.74 m
   joint-uncertain             picture, depth and its uncertainty: five masks; f/28.5, at 0.6 m

@@ -64,8 +64,8 @@ def pretrained_settings(name: str) -> SystemSettings:
     """Return the settings of camera and network of a shipped system, without building them.
 
     Example:
-        >>> pretrained_settings("edof-1").masks
-        1
+        >>> pretrained_settings("edof-5").masks
+        5
     """
     check_shipped(name)
     known, _ = SystemSettings.split(read_state(FOLDER / f"{name}.safetensors")["settings"])

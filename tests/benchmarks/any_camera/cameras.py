@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -23,10 +24,12 @@ from kornia_tidy.masks import (
 )
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.pretrained import load_pretrained
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 from kornia_tidy.seeds import keyed_seed
 
 WINDOW = 129  # px of the PSFs, as those of the shipped systems
+EARLIER = Path(__file__).parents[3] / "examples" / "paper" / "systems"  # that are no longer shipped
 SHIPPED = ("edof-1", "edof-5", "edof-designed", "edof-flat")
 FAMILIES = ("pixelwise", "fourier", "zernike", "radial", "spiral", "focal sweep", "like fishers", "flat", "flat")
 STRENGTH = (0.3, 1.2)  # factor of the phase of random masks, uniform in its logarithm
@@ -63,10 +66,15 @@ def pool_names(pool: str) -> list[str]:
     return [*SHIPPED, *drawn, *pool_names("sharp")] if pool == "training" else drawn
 
 
+def own_system(name: str) -> TrainedSystem:
+    """Return a system that is shipped, or was, with its own network."""
+    return load_pretrained(name) if name in PRETRAINED else load_trained(EARLIER / f"{name}.safetensors")
+
+
 def camera(name: str) -> TiDyOptics:
     """Return a camera by its name, noise-free, with all of its stray light."""
     if name in SHIPPED:
-        optics = load_pretrained(name).optics
+        optics = own_system(name).optics
     else:
         pool, _, index = name.rpartition("-")
         optics = _drawn(POOLS[pool], name, int(index))

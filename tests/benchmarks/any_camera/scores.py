@@ -16,14 +16,13 @@ from kornia_tidy.reconstruction.any_camera import AnyCameraHead, any_camera_head
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.metrics import psnr
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 from kornia_tidy.sensor.sensor import SensorNoise
-from tests.benchmarks.any_camera.cameras import SHIPPED, camera, in_words, pool_names
+from tests.benchmarks.any_camera.cameras import SHIPPED, camera, in_words, own_system, pool_names
 from tests.benchmarks.any_camera.training import start
 from tests.benchmarks.results.scenes import BenchScene, real_scenes
 
@@ -93,7 +92,7 @@ def score_closed_forms(name: str, scenes: list[BenchScene]) -> Any:
 def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, torch.nn.Module]) -> Any:
     """Return the PSNR of the rule and of networks capture by capture; behind a shipped camera also of its own."""
     own, found = Capturing(name), []
-    head = load_pretrained(name).head if name in SHIPPED else None
+    head = own_system(name).head if name in SHIPPED else None
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
         chosen = own.form.settings_of(capture, noise)

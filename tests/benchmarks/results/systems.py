@@ -24,6 +24,8 @@ WINDOW = 129  # pixels; smaller windows that are scaled to sum one flatter coded
 FIDELITY = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
 FLAT = (17.6, 22.0, 25.0, 30.0, 35.0, 42.0, 50.0, 60.0, 71.0, 100.0)  # f-numbers, a factor of about 2^(1/4) apart
 OCCLUDED = ("edof-5", "edof-designed", "edof-flat")  # these are measured on captures with occlusion, too
+EARLIER = {"edof-1": Path(__file__).parents[3] / "examples" / "paper" / "systems" / "edof-1.safetensors"}
+"""Systems that are no longer shipped."""
 FOCAL_LENGTH = 50e-3  # m, of the flat lenses as of the shipped cameras
 
 
@@ -63,7 +65,7 @@ class System:
 
 def available() -> dict[str, Callable[[], System]]:
     """Return a function for each system that the benchmark knows by name."""
-    known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in PRETRAINED}
+    known: dict[str, Callable[[], System]] = {name: _shipped(name) for name in (*PRETRAINED, *EARLIER)}
     known |= {f"{name} with occlusion": _with_occlusion(name) for name in OCCLUDED}
     known |= {f"flat f/{number:g}": _flat(number) for number in FLAT}
     return known | {f"preset {name}": _published(name) for name in SYSTEMS}
@@ -88,7 +90,8 @@ def of_trained(name: str, trained: TrainedSystem) -> System:
 
 
 def _shipped(name: str) -> Callable[[], System]:
-    return lambda: of_trained(name, load_pretrained(name))
+    earlier = EARLIER.get(name)
+    return lambda: of_trained(name, load_pretrained(name) if earlier is None else load_trained(earlier))
 
 
 def _with_occlusion(name: str) -> Callable[[], System]:

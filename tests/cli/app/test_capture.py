@@ -24,7 +24,7 @@ SMALL = {"side": 96}
 FILES = {"scene": "files", "image_file": "photo.png", "depth_file": "depth.png", "depth_scale": 0.001}
 EVERY_KIND = {
     "trained": {},
-    "trained for the image": {"camera": "edof-1", "compositing": "scatter", "noise": 0.01},
+    "trained for the image": {"camera": "edof-5", "compositing": "scatter", "noise": 0.01},
     "a plain lens": {"camera": "edof-flat", "stretch": False, "near": 0.4, "far": 5.0},
     "published": {"camera": "phasecam3d", "scene": "photographic leaves", "seed": 3},
     "published, other compositing": {"camera": "tidy-5", "compositing": "scatter", "mask_seed": 7},
