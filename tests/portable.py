@@ -30,6 +30,7 @@ KERNELS = (
     "tests/kernels/test_gather_ops.py",
     "tests/kernels/test_mutual_intensity_ops.py",
     "tests/kernels/test_occlusion_ops.py",
+    "tests/kernels/test_scattered_ops.py",
     "tests/render/backends/test_compiled.py",
     "tests/psf/test_energies.py",
 )

@@ -10,7 +10,15 @@ from itertools import product
 from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
 from kornia_tidy.kernels.compiler import find_compiler
 
-SOURCES = ("gather_ops", "overlap_ops", "occlusion_ops", "mutual_intensity_ops", "srgb_ops", "sensor_ops")
+SOURCES = (
+    "gather_ops",
+    "overlap_ops",
+    "occlusion_ops",
+    "mutual_intensity_ops",
+    "scattered_ops",
+    "srgb_ops",
+    "sensor_ops",
+)
 
 
 def kernels_in_words() -> Iterator[tuple[str, str]]:

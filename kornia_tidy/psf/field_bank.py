@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.field import Field
-from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_psfs, turned_lenses
+from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 
@@ -178,30 +177,25 @@ def field_psf_bank(
     apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
     metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
-    psfs: list[Any] = [0.0] * len(field)
-    light: list[Any] = [0.0] * len(field)
+    whole = there = phase.new_zeros(())
     for w, wavelength in enumerate(spectrum.wavelengths):
         seen, mixing = _mixing(spectrum, w, phase)
         if not seen:
             continue
         axis, *turned = turned_lenses(lens, metres, defocus, wavelength)
-        on_axis = lens_light(whole_cells(pupil), pupil.transmission, axis, sensor.tolerance).to(weights)
+        on_axis = lens_light(whole_cells(pupil), pupil.transmission, [axis], sensor.tolerance).to(weights)[0]
         if not bool((on_axis > 0).all()):  # False for NaN too
             raise ValueError(
                 f"aperture must let some light through the lens's stop and be finite, got an open area of "
                 f"{float(on_axis.min())}"
             )
-        for f, (seen_there, shifts) in enumerate(zip(turned, apart, strict=True)):
-            shown = weights, pupil.transmission, seen_there, sensor
-            energies, area = lens_psfs(screens[w], *shown, shifts[w, seen].tolist())
-            share = area / on_axis
-            lit = share[:, None, None, None] * energies
-            for v, weights_of_planes in enumerate(
-                mixing.T
-            ):  # no matrix product: its order follows the number of depths
-                psfs[f] = psfs[f] + weights_of_planes[:, None, None] * lit[:, v, None]
-                light[f] = light[f] + share[:, None] * weights_of_planes
-    whole, there = torch.stack(psfs), torch.stack(light)
+        limits = lens_limits(lens, defocus, wavelength)
+        energies, area = lens_psfs(screens[w], weights, pupil.transmission, turned, limits, sensor, apart[:, w, seen])
+        share = area / on_axis
+        lit = share[..., None, None, None] * energies
+        for v, weights_of_planes in enumerate(mixing.T):  # no matrix product: its order follows the number of depths
+            whole = whole + weights_of_planes[:, None, None] * lit[:, :, v, None]
+            there = there + share[..., None] * weights_of_planes
     energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
     points = phase.new_tensor([list(point) for point in field])
     return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
@@ -243,7 +237,7 @@ def field_light(
     metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
     for wavelength in spectrum.wavelengths:
         turned = turned_lenses(lens, metres, defocus, wavelength)
-        areas = torch.stack([lens_light(spans, pupil.transmission, there) for there in turned])
+        areas = lens_light(spans, pupil.transmission, turned)
         found.append(areas[1:] / areas[0])
     return torch.stack(found, -1) @ areas.new_tensor(spectrum.channel_weights).T
 

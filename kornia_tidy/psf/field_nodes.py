@@ -20,7 +20,6 @@ from torch import Tensor
 
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.field import Field, chebyshev_points, lagrange
 from kornia_tidy.psf.lens_psfs import turned_lenses
@@ -127,11 +126,11 @@ def _phases(
     """Return the phase between pairs of points of the stop, of several depths and pixels, (F, pairs) radians."""
     at = [(r * math.cos(t), r * math.sin(t)) for r, n in _RINGS for t in (2 * math.pi * i / n for i in range(n))]
     x, y = torch.tensor(at, dtype=torch.float64).T
-    points, rows = StopQuadrature(x, x, x[None], y[None], x), []
+    rows = []
     first, second = torch.triu_indices(len(at), len(at), 1)
     for turned in turned_lenses(lens, [(y * pitch, x * pitch) for y, x in field], defocus, wavelength):
         polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, y[None], x[None])
-        phase = turned.phase((points, polynomials))[:, 0]
+        phase = turned.phase(polynomials)[:, 0]
         along, across = (part[0] * 2 * math.pi * pitch * reach / wavelength for part in turned.frequencies(polynomials))
         seen = torch.cat([phase, phase + along, phase + across])  # (depths and pixels, points)
         rows.append((seen[:, first] - seen[:, second]).flatten())

@@ -11,18 +11,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.scattered_ops import Points
 from kornia_tidy.optics.default_device import on_cpu
+from kornia_tidy.optics.lens.field_table import defocus_terms
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.lens.lens_table import LensSample, degree_of, modes_of
+from kornia_tidy.optics.lens.lens_table import degree_of, modes_of
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrature
 from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
-from kornia_tidy.psf.scattered_transform import patches_of, scattered_axis, scattered_energies
+from kornia_tidy.psf.scattered_transform import scattered_energies, scattered_grid
 
 _LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
 _BEYOND = 1.5  # times the lens's range; PSFs within it may be interpolated
-_GRID = 41  # points along the stop at which the steepest phase is looked for
+_GRID = 21  # points along the stop at which the steepest phase is looked for
+_HEIGHTS = 5  # in the lens's field, where it is looked for
+_MARGIN = 1.02  # of the highest frequency, between these points
+_MEMORY = 1 << 24  # bytes of points at once
+_SMOOTH = 8  # least degree of polynomials for the light over the stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +53,31 @@ class Sensor:
     tolerance: float
 
 
+@dataclass(frozen=True)
+class Limits:
+    """How fine the PSFs of a lens are, anywhere in its field and within a range of defocus, at one wavelength.
+
+    Args:
+        slopes: steepest wavefront in radians per stop radius, and steepest change of the direction cosines along both
+            axes per stop radius, at some places and along either axis of the stop.
+        cosine: largest direction cosine along an axis, less the chief ray's.
+    """
+
+    slopes: tuple[tuple[float, float], ...]
+    cosine: float
+
+
 @on_cpu
 def lens_psfs(
     screens: Sequence[Screen],
     weights: Tensor,
     transmission: Tensor,
-    turned: TurnedLens,
+    turned: Sequence[TurnedLens],
+    limits: Limits,
     sensor: Sensor,
-    shifts: Sequence[tuple[float, float]] = ((0.0, 0.0),),
+    shifts: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    r"""Return PSFs at one field point and wavelength, averaged over states, and the light there.
+    r"""Return PSFs at field points and one wavelength, averaged over states, and the light there.
 
     .. math:: h(p) = \int_p \Big| \int_{stop} \sqrt{J}\, U e^{i W} e^{2 \pi i (L x + M y) / \lambda} \Big|^2
 
@@ -67,50 +88,66 @@ def lens_psfs(
         screens: fields in the stop, which add up.
         weights: share of the exposure of each state, (K,).
         transmission: of light by the cells of the last screen, (N, N) float64.
-        turned: the lens at the field point, see :func:`turned_lenses`.
+        turned: the lens at F field points, see :func:`turned_lenses`.
+        limits: of the lens, see :func:`lens_limits`.
         sensor: pixels, window and tolerance.
-        shifts: of the light along y and x in pixels, one for each copy of the PSFs.
+        shifts: of the light along y and x in pixels, for each of V copies of the PSFs, (F, V, 2).
 
     Returns:
-        Share of the light in each pixel, (D, V, P, P), and the area of direction cosines that an even scene fills,
-        (D,): see :func:`lens_light`.
+        Share of the light in each pixel, (F, D, V, P, P), and the area of direction cosines that an even scene fills,
+        (F, D): see :func:`lens_light`.
     """
-    wavelength = turned.wavelength
-    steepest, complex_dtype = turned.widest.steepest(sensor), screens[0].waves.dtype
+    scale = sensor.pitch / turned[0].wavelength  # cycles per pixel of a direction cosine
     widest = max(float((screen.spans[1] - screen.spans[0]).max()) for screen in screens)
-    stops = [_stop(turned, screen.spans, steepest * widest / 2, sensor.tolerance) for screen in screens]
-    points = [stop for stop, _ in stops]
-    frequencies = [turned.frequencies(basis) for _, basis in stops]
-    columns, rows = (torch.cat([pair[i] * -sensor.pitch / wavelength for pair in frequencies]) for i in (0, 1))
-    settings = sensor.window, sensor.tolerance, weights.dtype
-    columns = scattered_axis(columns, *settings, [shift[1] for shift in shifts])
-    rows = scattered_axis(rows, *settings, [shift[0] for shift in shifts])
-    passed, area = turned.light(*stops[-1], transmission)
-    passed = torch.where(passed == 0, 1, passed)  # where the rims cut all that the aperture leaves open it is dark
-    amplitude = torch.cat([turned.amplitude(*stop) for stop in stops], 1)
-    amplitude = amplitude * (sensor.pitch / wavelength / passed.detach().sqrt())[:, None, None]
-    phase = torch.cat([turned.phase(stop) for stop in stops], 1)
-    device = weights.device
-    patches = patches_of(torch.polar(amplitude, phase).to(complex_dtype), rows, columns).to(device)
-    chosen = [(p.row.to(device), p.column.to(device)) for p in points]
-    cells = torch.cat([s.waves[:, row, column] for s, (row, column) in zip(screens, chosen, strict=True)], 1)
-    energies = scattered_energies(cells, weights, patches, rows.to(device), columns.to(device))
-    if passed.requires_grad:  # of a learnt amplitude
-        energies = energies * (passed.detach() / passed).to(energies)[:, None, None, None]
-    return energies, area.to(weights)
+    half = max(phase + math.pi * sensor.window * scale * cosines for phase, cosines in limits.slopes) * widest / 2
+    grid = scattered_grid(limits.cosine * scale, sensor.window, sensor.tolerance, float(shifts.abs().max()))
+    waves, device = torch.cat([screen.waves.flatten(1) for screen in screens], 1), weights.device
+    groups, energies, areas = _alike(turned), [], []
+    for same in groups:
+        seen = [turned[i] for i in same]
+        stops = [_stop(seen[0], screen.spans, half, sensor.tolerance) for screen in screens]
+        passed, area = _light(seen, stops[-1], transmission)
+        passed = torch.where(passed == 0, 1, passed)  # where the rims cut all that the aperture leaves open it is dark
+        sides = [screen.waves.shape[-1] for screen in screens]
+        firsts = [sum(side**2 for side in sides[:n]) for n in range(len(sides))]
+        cells = torch.cat(
+            [
+                first + stop.points.row * side + stop.points.column
+                for first, side, stop in zip(firsts, sides, stops, strict=True)
+            ]
+        )
+        basis = torch.cat([stop.polynomials for stop in stops], 1).flatten(1)
+        weight = torch.cat([stop.points.weight for stop in stops]) * scale
+        terms = seen[0].phase_terms, seen[0].terms["amplitude"]
+        rows, many = _rows(seen, -scale / grid.step, (grid.extent - 1) / 2), 2 + terms[0].shape[1]
+        at_once = max(1, _MEMORY // (8 * rows.shape[1] * max(basis.shape[1], 1)))
+        for start in range(0, len(seen), at_once):
+            part = slice(start, start + at_once)
+            values = torch.stack([row @ basis for row in rows[part]]).unflatten(-1, weight.shape)
+            values[:, many:] *= weight
+            points = Points(*(own.to(device) for own in (cells, values, *terms)))
+            sums = (grid.sums(sensor.window, shifts[same[part], :, axis]).to(device) for axis in (0, 1))
+            found = scattered_energies(waves, weights, points, grid, *sums)
+            energies.append(found / passed[part].to(found)[..., None, None, None])
+        areas.append(area.to(weights))
+    return torch.cat(energies)[_in_order(groups)], torch.cat(areas)[_in_order(groups)]
 
 
 @on_cpu
-def lens_light(spans: Tensor, transmission: Tensor, turned: TurnedLens, tolerance: float = 1e-4) -> Tensor:
-    """Return the area of direction cosines that an even scene fills at a field point, (D,) float64: its irradiance.
+def lens_light(spans: Tensor, transmission: Tensor, turned: Sequence[TurnedLens], tolerance: float = 1e-4) -> Tensor:
+    """Return the area of direction cosines that an even scene fills at F points, (F, D) float64: its irradiance.
 
     Args:
         spans: begin and end of the mask's cells along either axis in stop radii, (2, N) float64.
         transmission: of light by the cells, (N, N).
-        turned: the lens at the field point.
+        turned: the lens at the field points.
         tolerance: of the area.
     """
-    return turned.light(*_stop(turned, spans, 0.0, tolerance), transmission)[1]
+    groups, areas = _alike(turned), []
+    for same in groups:
+        seen = [turned[i] for i in same]
+        areas.append(_light(seen, _stop(seen[0], spans, 0.0, tolerance), transmission)[1])
+    return torch.cat(areas)[_in_order(groups)]
 
 
 @on_cpu
@@ -129,22 +166,67 @@ def turned_lenses(
         - Points beyond the lens's table give no warning: only interpolation needs them.
     """
     psi = torch.tensor(defocus, dtype=torch.float64)
-    heights = torch.tensor([math.hypot(*point) for point in field], dtype=torch.float64)
-    # PSFs are as fine as the lens's whole range asks, or a multiple of it, whatever they are computed with.
-    times = max(1, math.ceil(float(psi.abs().max()) / (_BEYOND * max(map(abs, lens.table.reach)) or 1.0)))
-    ends = times * torch.tensor(lens.table.reach, dtype=torch.float64)
-    found = []
-    for sample, own in (
-        (lens.table.at(heights, ends, wavelength), ends),
-        (lens.table.at(heights, psi, wavelength), psi),
-    ):
-        found.append([TurnedLens(sample, i, math.atan2(*point), own, wavelength) for i, point in enumerate(field)])
-    for widest, turned in zip(*found, strict=True):
-        turned.widest = widest
-    return found[1]
+    heights, azimuths = torch.tensor([(math.hypot(*p), math.atan2(*p)) for p in field], dtype=torch.float64).T
+    series = lens.table.series(heights, wavelength)
+    parts = {name: getattr(series, name) for name in _PARTS}
+    degree = max(2, *(degree_of(part.shape[-1], sines=name in _SINES) for name, part in parts.items()))
+    turned = {name: _turned(part, azimuths, degree, sines=name in _SINES) for name, part in parts.items()}
+    terms = {
+        name: defocus_terms(psi, lens.table.reach, part.shape[1]) for name, part in parts.items() if part.ndim == 3
+    }
+    return [
+        TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, edges, azimuth, psi, wavelength)
+        for i, (edges, azimuth) in enumerate(zip(series.edges, azimuths.tolist(), strict=True))
+    ]
 
 
-Stop = tuple[StopQuadrature, Tensor]  # points in patches, (C, S), and polynomials there, (J, C, S)
+@on_cpu
+def lens_limits(lens: Lens, defocus: Sequence[float], wavelength: float) -> Limits:
+    """Return how fine the PSFs of a lens can be.
+
+    As its whole field and range of defocus ask, or a multiple of the range: so that PSFs are as fine whatever they are
+    computed with.
+    """
+    reach = lens.table.reach
+    times = max(1, math.ceil(max(map(abs, defocus)) / (_BEYOND * max(map(abs, reach)) or 1.0)))
+    heights = np.linspace(0, float(lens.table.field[0]), _HEIGHTS)
+    places = [(h * math.sin(a), h * math.cos(a)) for h in heights.tolist() for a in (0.0, math.pi / 4)]
+    seen = turned_lenses(lens, places, [times * end for end in reach], wavelength)
+    polynomials, inside = _stop_grid(seen[0].degree)
+    basis, stop = polynomials.flatten(1), polynomials.shape[1:]
+    turns = _rows(seen, 1.0, 0.0)
+    phases = turns[:, 2 : 2 + seen[0].phase_terms.shape[1]]
+    phase = (2 * math.pi * seen[0].phase_terms @ phases @ basis).unflatten(-1, stop)  # (places, 2, rows, columns)
+    cosines = (turns[:, :2] @ basis).unflatten(-1, stop)
+    slopes, per_radius = [], (_GRID - 1) / 2
+    for axis in (0, 1):
+        valid = inside.narrow(axis, 1, _GRID - 1) & inside.narrow(axis, 0, _GRID - 1)
+        steps = (part.diff(dim=axis + 2).abs()[..., valid] * per_radius for part in (phase, cosines))
+        steepest, spread = (part.amax(2) for part in steps)  # (places, 2) each: at either end, along y and x
+        slopes += zip(steepest.amax(1).tolist(), spread.sum(1).tolist(), strict=True)
+    return Limits(tuple(slopes), float(cosines[..., inside].abs().max()) * _MARGIN)
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """Quadrature over the open stop, with polynomials of its points, (J, C, S), and their sums over cells, (Ji, C)."""
+
+    points: StopQuadrature
+    polynomials: Tensor
+    moments: Tensor
+
+
+def _alike(turned: Sequence[TurnedLens]) -> list[list[int]]:
+    """Return the field points from which the open stop looks the same."""
+    found: dict[tuple[float, ...], list[int]] = {}
+    for i, own in enumerate(turned):
+        found.setdefault(tuple(own.discs().flatten().tolist()), []).append(i)
+    return list(found.values())
+
+
+def _in_order(groups: list[list[int]]) -> Tensor | slice:
+    """Return where the field points stand in groups that follow each other."""
+    return slice(None) if len(groups) == 1 else torch.tensor([i for same in groups for i in same]).argsort()
 
 
 def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:
@@ -166,7 +248,72 @@ def _stop_points(
         fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
         points = stop_quadrature(fine, order, np.array(discs))
         points = StopQuadrature(points.row // parts, points.column // parts, points.x, points.y, points.weight)
-        return points, zernike_polynomials((degree + 1) * (degree + 2) // 2, points.y, points.x)
+        count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
+        polynomials = zernike_polynomials(max(count, smooth), points.y, points.x)
+        return Stop(points, polynomials[:count].clone(), (polynomials[:smooth] * points.weight).sum(-1))
+
+
+def _count(degree: int) -> int:
+    return (degree + 1) * (degree + 2) // 2
+
+
+@lru_cache(maxsize=8)
+def _stop_grid(degree: int) -> tuple[Tensor, Tensor]:
+    """Return the polynomials on a grid over the stop, (J, n, n), and where it lies within the stop's edge."""
+    with torch.inference_mode(False):
+        line = torch.linspace(-1, 1, _GRID, dtype=torch.float64)
+        y, x = torch.meshgrid(line, line, indexing="ij")
+        return zernike_polynomials(_count(degree), y, x), x.square() + y.square() <= 1 + 1e-9
+
+
+@lru_cache(maxsize=8)
+def _projection(degree: int) -> tuple[Tensor, Tensor]:
+    """Return the polynomials at points of the disc, (J, n), and what gives a function's series from its values, (n, J).
+
+    Gauss's rule for the radius squared and evenly spaced azimuths integrate products of the polynomials exactly.
+    """
+    with torch.inference_mode(False):
+        nodes, weights = np.polynomial.legendre.leggauss(degree // 2 + 1)
+        radius, around = np.sqrt((nodes + 1) / 2)[:, None], 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1)
+        y, x = (torch.from_numpy((radius * part(around)).ravel()) for part in (np.sin, np.cos))
+        polynomials = zernike_polynomials(_count(degree), y, x)
+        share = torch.from_numpy(np.repeat(weights / 2 / len(around), len(around)))
+        return polynomials, (polynomials * share).T
+
+
+def _light(turned: Sequence[TurnedLens], stop: Stop, transmission: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the object's light that passes the stop, and the area of cosines that it fills, (F, D) each."""
+    first = turned[0]
+    passing = stop.moments @ transmission[stop.points.row, stop.points.column]  # of each polynomial
+    polynomials, series = _projection(max(first.degree, _SMOOTH))
+    count = _count(first.degree)
+
+    def over_depths(name: str, basis: Tensor) -> Tensor:  # (J, ...) to (F, D, ...)
+        rows = torch.stack([own.parts[name] @ basis for own in turned])  # one product would round by how many they are
+        return sum(term[:, None] * row[:, None] for term, row in zip(first.terms[name].T, rows.unbind(1), strict=True))
+
+    light = over_depths("illumination", polynomials[:count])
+    ratio = over_depths("amplitude", polynomials[:count]).square() / light
+    return over_depths("illumination", passing[:count, None])[..., 0], (ratio * (series @ passing)).sum(-1)
+
+
+def _rows(turned: Sequence[TurnedLens], stretch: float, middle: float) -> Tensor:
+    """Return the series of what points in the stop are, (F, rows, J).
+
+    Rows are the direction cosines along y and x, less the chief ray's, times a factor and with a constant added; the
+    terms of the wavefront in turns; those of the amplitude.
+    """
+    first = turned[0]
+    parts = {name: torch.stack([own.parts[name] for own in turned]) for name in _PARTS}
+    azimuth = torch.tensor([own.azimuth for own in turned], dtype=torch.float64)[:, None]
+    cosine, sine = azimuth.cos(), azimuth.sin()
+    along, across = parts["radial"], parts["tangential"]
+    places = torch.stack([along * sine + across * cosine, along * cosine - across * sine], 1) * stretch
+    places[..., 0] += middle
+    wave = parts["wavefront"] * (first.scale / (2 * math.pi))
+    ideal = torch.zeros(len(turned), 1, wave.shape[-1], dtype=torch.float64)
+    ideal[..., 0], ideal[..., 4] = 1 / 2, 1 / math.sqrt(12)  # radius squared
+    return torch.cat([places, wave, ideal, parts["amplitude"]], 1)
 
 
 @lru_cache(maxsize=32)
@@ -177,34 +324,53 @@ def _places_of_modes(count: int, sines: bool) -> tuple[Tensor, Tensor, Tensor]:
         return m.double(), (n * (n + 2) + m) // 2, (n * (n + 2) - m) // 2
 
 
+_PARTS = ("wavefront", "radial", "tangential", "amplitude", "illumination")
+_SINES = {"tangential"}
+
+
+def _turned(coefficients: Tensor, azimuths: Tensor, degree: int, *, sines: bool) -> Tensor:
+    """Return series of all polynomials for fields at azimuths, (F, ..., J), from those for fields along +x."""
+    whole = coefficients.new_zeros(*coefficients.shape[:-1], _count(degree))
+    orders, even, odd = _places_of_modes(coefficients.shape[-1], sines)
+    turns = (azimuths[:, None] * orders).view(-1, *[1] * (coefficients.ndim - 2), len(orders))
+    cosine, sine = turns.cos(), turns.sin()
+    whole[..., even] = coefficients * (-sine if sines else cosine)
+    turning = orders > 0
+    whole[..., odd[turning]] = (coefficients * (cosine if sines else sine))[..., turning]
+    return whole
+
+
+@dataclass(frozen=True, eq=False)
 class TurnedLens:
-    """A lens at one field point of a sample, in the coordinates of the mask and of the sensor."""
+    """A lens at one field point and D depths, in the coordinates of the mask and of the sensor.
 
-    def __init__(self, sample: LensSample, index: int, azimuth: float, psi: Tensor, wavelength: float) -> None:
-        self.psi, self.azimuth, self.wavelength = psi, azimuth, wavelength
-        self.widest = self  # the same at the ends of the range of defocus
-        self.scale = REFERENCE_WAVELENGTH / wavelength
-        self.edges = sample.edges[index]
-        sines = {"tangential"}
-        names = ("wavefront", "radial", "tangential", "amplitude", "illumination")
-        parts = {name: getattr(sample, name)[index] for name in names}
-        self.degree = max(degree_of(part.shape[-1], sines=name in sines) for name, part in parts.items())
-        self.parts = {name: self._turned(part, sines=name in sines) for name, part in parts.items()}
+    Args:
+        parts: of the lens's table as series of all Zernike polynomials up to a degree, (terms, J) or (J,).
+        terms: what sums the terms of a part at each depth, (D, terms).
+        degree: of the polynomials.
+        edges: of rims, centre along the field and radius in stop radii, (E, 2).
+        azimuth: of the field point, from +x towards +y.
+        psi: defocus in radians at 530 nm, (D,).
+        wavelength: in metres.
+    """
 
-    def _turned(self, coefficients: Tensor, *, sines: bool) -> Tensor:
-        """Return coefficients of all polynomials for the field's azimuth, from those for a field along +x."""
-        whole = coefficients.new_zeros(*coefficients.shape[:-1], (self.degree + 1) * (self.degree + 2) // 2)
-        orders, even, odd = _places_of_modes(coefficients.shape[-1], sines)
-        cosine, sine = torch.cos(orders * self.azimuth), torch.sin(orders * self.azimuth)
-        whole[..., even] = coefficients * (-sine if sines else cosine)
-        turning = orders > 0
-        whole[..., odd[turning]] = (coefficients * (cosine if sines else sine))[..., turning]
-        return whole
+    parts: dict[str, Tensor]
+    terms: dict[str, Tensor]
+    degree: int
+    edges: Tensor
+    azimuth: float
+    psi: Tensor
+    wavelength: float
 
-    def _values(self, name: str, polynomials: Tensor) -> Tensor:
-        coefficients, flat = self.parts[name], polynomials.flatten(1)
-        rows = [row @ flat for row in coefficients.view(-1, len(flat))]  # one product would round by how many they are
-        return torch.stack(rows).view(*coefficients.shape[:-1], *polynomials.shape[1:])
+    @property
+    def scale(self) -> float:
+        """From radians at 530 nm to radians at the wavelength."""
+        return REFERENCE_WAVELENGTH / self.wavelength
+
+    @property
+    def phase_terms(self) -> Tensor:
+        """Terms of the wavefront's rows in turns, that of an ideal lens last, (D, R) float64."""
+        return torch.cat([self.terms["wavefront"], self.psi[:, None] * self.scale / (2 * math.pi)], 1)
 
     def discs(self) -> Tensor:
         """Return centre x, y and radius of the discs that light must pass, (E, 3): first the stop's own."""
@@ -214,41 +380,12 @@ class TurnedLens:
             [torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), torch.cat([centres, self.edges[:, 1:]], 1)]
         )
 
-    def phase(self, stop: Stop) -> Tensor:
-        """Return the wavefront in radians at the wavelength, (D, C, S)."""
-        points, polynomials = stop
-        ideal = self.psi[:, None, None] * (points.x.square() + points.y.square())
-        return (self._values("wavefront", polynomials) + ideal) * self.scale
+    def phase(self, polynomials: Tensor) -> Tensor:
+        """Return the wavefront in radians at the wavelength, (J, ...) to (D, ...)."""
+        rows = _rows([self], 1.0, 0.0)[0, 2 : 2 + self.phase_terms.shape[1]]
+        return 2 * math.pi * torch.tensordot(self.phase_terms @ rows, polynomials, 1)
 
     def frequencies(self, polynomials: Tensor) -> tuple[Tensor, Tensor]:
         """Return the direction cosines along x and y in which light arrives, less the chief ray's."""
-        along, across = self._values("radial", polynomials), self._values("tangential", polynomials)
-        cosine, sine = math.cos(self.azimuth), math.sin(self.azimuth)
-        return along * cosine - across * sine, along * sine + across * cosine
-
-    def amplitude(self, points: StopQuadrature, polynomials: Tensor) -> Tensor:
-        """Return the amplitude of light on its way, with the quadrature's weights, (D, C, S)."""
-        return self._values("amplitude", polynomials) * points.weight
-
-    def light(self, points: StopQuadrature, polynomials: Tensor, transmission: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the object's light that passes the stop, and the area of cosines that it fills, (D,) each."""
-        weight = points.weight * transmission[points.row, points.column][:, None]
-        light = self._values("illumination", polynomials)
-        return (light * weight).sum((1, 2)), (self._values("amplitude", polynomials).square() / light * weight).sum(
-            (1, 2)
-        )
-
-    def steepest(self, sensor: Sensor) -> float:
-        """Return a bound of the gradient of the phase over the stop and for all pixels, radians per stop radius."""
-        line = torch.linspace(-1, 1, _GRID, dtype=torch.float64)
-        y, x = torch.meshgrid(line, line, indexing="ij")
-        polynomials = zernike_polynomials((self.degree + 1) * (self.degree + 2) // 2, y, x)
-        phase = self.phase((StopQuadrature(line, line, x, y, x), polynomials))
-        along, across = self.frequencies(polynomials)
-        inside, slope, widest = x.square() + y.square() <= 1, 0.0, math.pi * sensor.window * sensor.pitch
-        for axis in (0, 1):
-            valid = inside.narrow(axis, 1, _GRID - 1) & inside.narrow(axis, 0, _GRID - 1)
-            steps = [part.diff(dim=axis).abs()[valid].max() for part in (along, across)]
-            of_window = widest / REFERENCE_WAVELENGTH * self.scale * sum(map(float, steps))
-            slope = max(slope, float(phase.diff(dim=axis + 1).abs()[:, valid].max()) + of_window)
-        return slope * (_GRID - 1) / 2
+        y, x = torch.tensordot(_rows([self], 1.0, 0.0)[0, :2], polynomials, 1)
+        return x, y

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.optics.default_device import on_cpu
-from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.lens_psfs import TurnedLens
 
@@ -77,7 +76,7 @@ def _slopes(turned: TurnedLens, y: Tensor, x: Tensor, axis: int) -> tuple[Tensor
     step = torch.tensor([-_STEP, _STEP], dtype=torch.float64)[:, None]
     y, x = (y + step, x.expand(2, -1)) if axis == 0 else (y.expand(2, -1), x + step)
     polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, y, x)
-    waves = turned.phase((StopQuadrature(y, y, x, y, x), polynomials)) * turned.wavelength / (2 * math.pi)
+    waves = turned.phase(polynomials) * turned.wavelength / (2 * math.pi)
     along, across = turned.frequencies(polynomials)
     cosines = torch.stack([across, along], -1)
     return (waves[:, 1] - waves[:, 0]) / (2 * _STEP), (cosines[1] - cosines[0]) / (2 * _STEP)

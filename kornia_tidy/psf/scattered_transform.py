@@ -2,162 +2,148 @@ r"""Fourier transform of scattered points to the light in the pixels of a sensor
 
 .. math:: I(p) = \int_p \Big| \sum_j c_j e^{-2\pi i (\nu_j X + \mu_j Y)} \Big|^2 dX \, dY
 
-The points are spread on a grid with a kernel of a few samples, transformed by FFT, and the kernel's transform is
-divided out: a nonuniform FFT of type 1. The samples of the intensity lie denser than its bandwidth asks, so that the
-integral over a pixel is a short sum of them.
+The points are spread on a small grid with a kernel of a few samples, transformed along either axis by a matrix, and the
+kernel's transform is divided out: a nonuniform transform of type 1. Grid and samples lie evenly about their middles, so
+that sums and differences of mirrored rows are transformed by real matrices of half the size. The samples of the
+intensity lie denser than its bandwidth asks, so that the integral over a pixel is a short sum of them.
 
-Source: Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41(5) C479 (2019), for the kernel; Kaiser's window for
-the interpolation between samples.
+Source: Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41(5) C479 (2019), for the transform; Kaiser's window
+for the kernel and for the interpolation between samples.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.window_sides import next_fast_size
+from kornia_tidy.kernels.build import compiled
+from kornia_tidy.kernels.scattered_ops import SOURCE, Points, scattered_light, scattered_light_by_torch
+from kornia_tidy.mode import Mode, torch_mode
 
 _SIGMA = 1.6  # period of the transform over the window: light beyond it folds back outside the used part
 _DENSITY = 1.5  # samples of the intensity over those that its bandwidth needs
-_NODES = 48
+_NODES = 96
+_STEP = 0.25  # pixels in which the largest shift is counted
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
-    """One axis of the transform.
+class Grid:
+    """Grid of the transform, alike for both axes.
 
     Args:
-        start: first sample of the grid that each patch of points touches, (C,).
-        kernel: weights of each point on the samples of its patch, (C, S, T).
-        extent: samples of the grid that points touch.
-        size: samples of the transform, the grid's first.
-        correction: of the transform at the samples kept, (N,): one over the kernel's transform.
-        pixels: sums over samples that give the light in pixels, one for each shift, (V, P, N).
+        step: cycles per pixel from sample to sample.
+        extent: samples M, even; frequency zero is in their middle.
+        width: samples that a point is spread on.
+        kernel: the spreading kernel as a polynomial in 1 - x^2, with x from -1 to 1 over its width, (n,) float64.
+        cosines: transform of sums of mirrored rows, (N / 2, M / 2) float64, over the kernel's transform.
+        sines: the same of differences.
+        spacing: pixels from sample to sample of the intensity; N, even, lie about the middle of the window.
+        reach: samples to either side that the interpolation between samples takes.
+        decay: of its window.
     """
 
-    start: Tensor
-    kernel: Tensor
+    step: float
     extent: int
-    size: int
-    correction: Tensor
-    pixels: Tensor
+    width: int
+    kernel: Tensor
+    cosines: Tensor
+    sines: Tensor
+    spacing: float
+    reach: int
+    decay: float
 
-    def to(self, device: torch.device) -> Axis:
-        """Return the axis on a device."""
-        parts = (self.start, self.kernel, self.correction, self.pixels)
-        start, kernel, correction, pixels = (part.to(device) for part in parts)
-        return replace(self, start=start, kernel=kernel, correction=correction, pixels=pixels)
+    def sums(self, window: int, shifts: Tensor) -> Tensor:
+        """Return the sums over samples that give the light in pixels along an axis, (F, V, P, N), for shifts (F, V)."""
+        if not bool(shifts.any()):
+            return self._centred(window).expand(*shifts.shape, -1, -1)
+        return torch.stack([self._shifted(window, tuple(row)) for row in shifts.tolist()])
+
+    @lru_cache(maxsize=8)  # noqa: B019 (grids are remembered themselves)
+    def _centred(self, window: int) -> Tensor:
+        return self._shifted(window, (0.0,))[0]
+
+    def _shifted(self, window: int, shifts: tuple[float, ...]) -> Tensor:
+        count = 2 * len(self.cosines)
+        at = np.arange(count) - (count - 1) / 2
+        edges = np.arange(window + 1) - window / 2 - np.array(shifts)[:, None]
+        within = _interpolant_integral(edges[..., None] / self.spacing - at, self.reach, self.decay)
+        return torch.from_numpy(self.spacing * np.diff(within, axis=1))
 
 
-def scattered_axis(
-    frequency: Tensor, window: int, tolerance: float, dtype: torch.dtype, shifts: Sequence[float] = (0.0,)
-) -> Axis:
-    """Return one axis of the transform of points.
+@lru_cache(maxsize=32)
+def scattered_grid(highest: float, window: int, tolerance: float, shift: float = 0.0) -> Grid:
+    """Return the grid for points up to a frequency.
 
     Args:
-        frequency: of the points in cycles per pixel, (C, S) float64; those of a patch lie close together.
+        highest: modulus of a frequency along an axis in cycles per pixel.
         window: side P in pixels, odd.
         tolerance: error of the field, relative to the sum of the points' moduli.
-        dtype: float32 or float64 of the matrices.
-        shifts: of the light in pixels, one for each copy of the PSFs.
+        shift: of the light in pixels, at most.
 
     Example:
-        >>> axis = scattered_axis(torch.linspace(-0.4, 0.4, 64, dtype=torch.float64)[:, None], 9, 1e-6, torch.float64)
-        >>> axis.pixels.shape[0], axis.size
-        (1, 90)
+        >>> grid = scattered_grid(0.3, 9, 1e-3)
+        >>> grid.extent, 2 * len(grid.cosines), grid.sums(9, torch.zeros(2, 1)).shape
+        (28, 32, torch.Size([2, 1, 9, 32]))
     """
-    low, span = float(frequency.min()), max(float(frequency.max() - frequency.min()), 1e-3)
+    span = max(2 * highest, 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH) + 1)
     decay = -math.log(tolerance) + 1
     reach = math.ceil(math.hypot(decay, math.pi) / (math.pi * (1 - 1 / _DENSITY)))
-    finest = 1 / (2 * _DENSITY * span)  # pixels between samples of the intensity, at most
-    most = max(abs(shift) for shift in shifts)
-    furthest = window / 2 + most + (reach + 1) * finest
-    step = 1 / (2 * _SIGMA * furthest)  # cycles per pixel between samples of the grid
-    size = next_fast_size(max(math.ceil(1 / (step * finest)), math.ceil(span / step) + width + 2))
-    place = (frequency - low) / step + width / 2  # of the points, in samples
-    start = torch.ceil(place.amin(1) - width / 2).long()
-    patch = int((torch.floor(place.amax(1) + width / 2).long() - start).max()) + 1
-    away = (start[:, None] + torch.arange(patch))[:, None] - place[..., None]
-    kernel = _spread(2 * away / width, width)
-    sample = 1 / (size * step)  # pixels
-    count = min(math.floor((window / 2 + most) / sample) + reach + 1, size // 2 - 1)
-    at = np.arange(-count, count + 1)
-    edges = np.arange(window + 1) - window / 2 - np.array(shifts)[:, None]
-    sums = sample * np.diff(_interpolant_integral(edges[..., None] / sample - at, reach, decay), axis=1)
-    correction = 1 / _spread_transform(at / size, width)
-    matrices = (torch.from_numpy(part).to(dtype) for part in (correction, sums))
-    return Axis(start, kernel.to(dtype), int(start.max()) + patch, size, *matrices)
+    spacing = 1 / (2 * _DENSITY * span)
+    half = math.ceil((window / 2 + math.ceil(shift / _STEP) * _STEP) / spacing) + reach
+    step = 1 / (2 * _SIGMA * half * spacing)
+    extent = 2 * math.ceil((span / step + width + 1) / 2)
+    at = np.arange(half) + 0.5
+    correction = 1 / _spread_transform(at * spacing * step, width)
+    turns = 2 * math.pi * spacing * step * at[:, None] * (np.arange(extent // 2) + 0.5)
+    cosines, sines = (torch.from_numpy(correction[:, None] * part) for part in (np.cos(turns), np.sin(turns)))
+    kernel = torch.from_numpy(_kernel(width))
+    return Grid(step, extent, width, kernel, cosines, sines, spacing, reach, decay)
 
 
-def scattered_energies(waves: Tensor, weights: Tensor, patches: Tensor, rows: Axis, columns: Axis) -> Tensor:
-    """Return the light in each pixel, averaged over states, for each shift, (D, V, P, P).
+def scattered_energies(
+    waves: Tensor, weights: Tensor, points: Points, grid: Grid, rows: Tensor, columns: Tensor
+) -> Tensor:
+    """Return the light in each pixel, averaged over states, for each shift, (F, D, V, P, P).
 
     Args:
-        waves: of each state and patch, (K, C) complex.
+        waves: of each state and cell, (K, N) complex.
         weights: share of the exposure of each state, (K,).
-        patches: fields of patches of unit amplitude on their samples of the grid, (D, C, T, T) complex.
-        rows: axis y.
-        columns: axis x.
+        points: of F fields.
+        grid: that they are spread on.
+        rows: sums over samples for the pixels along y, (F, V, P, N).
+        columns: the same along x.
     """
-    tall, wide = patches.shape[-2:]
-    down, across = (torch.arange(side, device=patches.device) for side in (tall, wide))
-    index = (rows.start[:, None] + down)[:, :, None] * columns.extent + (columns.start[:, None] + across)[:, None]
-    shape, index, found = (rows.extent, columns.extent), index.flatten(), []
-    for patch in patches:
-        flat = (waves[:, :, None, None] * patch).flatten(1)
-        grid = flat.new_zeros(len(waves), shape[0] * shape[1]).index_add(1, index, flat).unflatten(1, shape)
-        field = _transformed(_transformed(grid, columns, -1), rows, -2)
-        light = torch.einsum("k,kyx->yx", weights, field.real.square() + field.imag.square())
-        found.append(rows.pixels @ light @ columns.pixels.transpose(1, 2))
-    return torch.stack(found)
-
-
-def patches_of(field: Tensor, rows: Axis, columns: Axis) -> Tensor:
-    """Return points spread on the grid, patch by patch: (D, C, S) complex to (D, C, T, T)."""
-    down = rows.kernel.transpose(1, 2)
-    real, imaginary = (  # depth by depth, so that none is rounded by how many they are
-        torch.stack([down @ (own[..., None] * columns.kernel) for own in part]) for part in (field.real, field.imag)
-    )
-    return torch.complex(real, imaginary)
-
-
-def _transformed(grid: Tensor, axis: Axis, dim: int) -> Tensor:
-    """Return the samples of a transform that lie in the window, in order, without the kernel's decline."""
-    count = len(axis.correction) // 2
-    field = torch.fft.fft(grid, axis.size, dim=dim)
-    kept = torch.cat([field.narrow(dim, axis.size - count, count), field.narrow(dim, 0, count + 1)], dim)
-    return kept * (axis.correction if dim == -1 else axis.correction[:, None])
+    tables = (part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines))
+    given = waves, weights, points, grid.width, *tables, rows.to(weights), columns.to(weights)
+    here = waves.device.type == "cpu" and not torch_mode() & Mode.TRACED
+    if here and compiled(SOURCE, weights.dtype) is not None:
+        return scattered_light(*given)
+    return scattered_light_by_torch(*given)
 
 
 _WIDTH = 1.0 / (1 - 1 / (2 * _SIGMA)) / 2 * 1.5
 
 
-def _shape(width: int) -> float:
-    return 0.97 * math.pi * width * (1 - 1 / (2 * _SIGMA))
-
-
-def _spread(at: Tensor, width: int) -> Tensor:
-    """Return the exponential of a semicircle over [-1, 1]."""
-    inside = (1 - at.square()).clamp(min=0)
-    return torch.where(at.abs() <= 1, torch.exp(_shape(width) * (inside.sqrt() - 1)), 0.0)
-
-
-@lru_cache(maxsize=4)
-def _legendre(order: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.polynomial.legendre.leggauss(order)
+@lru_cache(maxsize=16)
+def _kernel(width: int) -> np.ndarray:
+    """Return Kaiser's window over [-1, 1] as a polynomial in 1 - x^2."""
+    shape = math.pi * math.sqrt(max((width * (1 - 1 / (2 * _SIGMA))) ** 2 - 0.8, 0.25))
+    series = np.polynomial.Chebyshev.interpolate(
+        lambda u: np.i0(shape * np.sqrt(np.maximum(u, 0))) / np.i0(shape), width + 4, [0, 1]
+    )
+    return series.convert(kind=np.polynomial.Polynomial).coef
 
 
 def _spread_transform(frequency: np.ndarray, width: int) -> np.ndarray:
     """Return the Fourier transform of the kernel, frequency in cycles per sample."""
-    nodes, weights = _legendre(2 * _NODES)
-    values = weights * np.exp(_shape(width) * (np.sqrt(1 - nodes**2) - 1)) * width / 2
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    values = weights * np.polynomial.polynomial.polyval(1 - nodes**2, _kernel(width)) * width / 2
     return np.cos(math.pi * width * frequency[:, None] * nodes) @ values
 
 

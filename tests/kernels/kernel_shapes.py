@@ -36,7 +36,7 @@ from kornia_tidy.render.layers import weight_of_layer
 from kornia_tidy.render.scene import LayeredScene, layered_scene
 from kornia_tidy.render.stray_light import normalised_share
 from tests.psf.energies_tester import gradient_round_off, round_off, written_out
-from tests.rounding import gamma
+from tests.rounding import gamma, magnitude
 
 DTYPES = (torch.float32, torch.float64)
 
@@ -72,7 +72,7 @@ class Call:
     def got(self) -> Tensor:
         """What the operator returns, of gradients the first one, complex ones as real numbers."""
         made = self.operator(*self.arguments)
-        first = made[0] if isinstance(made, list) else made
+        first = made[0] if isinstance(made, (list, tuple)) else made
         return torch.view_as_real(first) if first.is_complex() else first
 
     def error(self) -> float:
@@ -400,6 +400,79 @@ def field_gradient(draw: random.Random) -> Call:
     return Call(about, "mutual_field_gradient", (*case, light), 2 * products, truth)
 
 
+def scattered(draw: random.Random) -> Call:
+    """``scattered_light`` of scattered.c: the light."""
+    case, about, products = _scattered(draw)
+    return Call(about, "scattered_light", case, products, lambda: scattered_written_out(*case))
+
+
+def scattered_gradient(draw: random.Random) -> Call:
+    """The same for a gradient of the light: that of the waves."""
+    case, about, products = _scattered(draw)
+    light = torch.randn(len(case[3]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 2)), dtype=case[1].dtype)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        exact = [case[0].to(torch.complex128, copy=True).requires_grad_(), case[1].double()]
+        value, _ = scattered_written_out(*exact, *case[2:])
+        (expected,) = torch.autograd.grad((value * light.double()).sum(), exact[0])
+        large = magnitude(case[0]).to(torch.complex128).requires_grad_()
+        _, allowed = scattered_written_out(large, case[1].double(), *case[2:])
+        (bound,) = torch.autograd.grad((allowed * light.double().abs()).sum(), large)
+        return torch.view_as_real(expected), 2 * bound.real[..., None]
+
+    return Call(about, "scattered_light_gradients", (*case, light), 2 * products, truth)
+
+
+def scattered_written_out(
+    waves: Tensor,
+    weights: Tensor,
+    cell: Tensor,
+    values: Tensor,
+    phase_terms: Tensor,
+    amplitude_terms: Tensor,
+    width: int,
+    kernel: Tensor,
+    cosines: Tensor,
+    sines: Tensor,
+    rows: Tensor,
+    columns: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The light by complex matrices in float64, and the round-off that it may be off by.
+
+    That is the same sum of moduli, times the roundings of each product. The kernel's argument is rounded too, which its
+    coefficients times their powers bound, and so is the phase, by less than six roundings of a radian.
+    """
+    dtype, phases = weights.dtype if kernel.dtype == torch.float64 else kernel.dtype, phase_terms.shape[1]
+    extent, patches, points = 2 * cosines.shape[1], *values.shape[2:]
+    powers = torch.arange(len(kernel), dtype=torch.float64)
+    lines = torch.arange(extent, dtype=torch.float64)
+    even, odd = cosines.double(), sines.double()
+    upper = torch.cat([even.flip(1) + 1j * odd.flip(1), even - 1j * odd], 1)  # samples and rows lie about their middles
+    whole = torch.cat([upper.flip(0).conj(), upper])
+    large = whole.real.abs() + whole.imag.abs()
+    found, allowed = [], []
+    roundings = points * patches + 2 * extent + 2 * len(waves) + len(whole) + 8 * len(kernel) + 64
+    for place, down, right in zip(values, rows.double(), columns.double(), strict=True):
+        inside = 1 - (2 * (lines - place[:2, ..., None]) / width).square()  # (2, C, S, M)
+        spread = torch.where(inside > 0, (inside[..., None] ** powers * kernel.double()).sum(-1), 0.0)
+        broad = torch.where(inside > -1e-3, ((1 + 4 * width * powers) * kernel.double().abs()).sum(), 0.0)
+        for p, q in zip(phase_terms, amplitude_terms, strict=True):
+            size = torch.tensordot(q, place[2 + phases :], 1)
+            field = (
+                torch.polar(torch.ones_like(size), 2 * torch.pi * torch.tensordot(p, place[2 : 2 + phases], 1)) * size
+            )
+            moduli = torch.tensordot(q.abs(), place[2 + phases :].abs(), 1)
+            own = waves[:, cell].to(torch.complex128)
+            grid = torch.einsum("kc,cs,csm,csn->kmn", own, field, spread[0].to(own), spread[1].to(own))
+            light = torch.einsum("k,kyx->yx", weights.double(), (whole @ grid @ whole.mT).abs().square())
+            most = torch.einsum("kc,cs,csm,csn->kmn", own.real.abs() + own.imag.abs(), moduli, *broad)
+            bound = torch.einsum("k,kyx->yx", weights.double(), (large @ most @ large.mT).square())
+            found.append(down @ light @ right.mT)
+            allowed.append(gamma(roundings, dtype) * (down.abs() @ bound @ right.mT.abs()))
+    shape = len(rows), len(phase_terms), *rows.shape[1:3], rows.shape[2]
+    return torch.stack(found).view(shape), torch.stack(allowed).view(shape)
+
+
 def srgb(draw: random.Random) -> Call:
     """``convert`` of srgb.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
     image, encode, about = _colours(draw)
@@ -579,6 +652,44 @@ def _partially_coherent(draw: random.Random) -> tuple[tuple[Tensor, Tensor, Tens
     return (field, weights, kernels), about, depths * window**2 * cells * (cells + states * order**2)
 
 
+def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
+    """Points of some places on a grid, with a kernel that vanishes at its ends: no rounding moves it there."""
+    dtype = draw.choice(DTYPES)
+    states, cells, patches, points = draw.randint(1, 6), draw.randint(1, 12), draw.randint(1, 20), draw.randint(1, 18)
+    places, depths, shifts, width = draw.randint(1, 2), draw.randint(1, 3), draw.randint(1, 2), draw.randint(2, 8)
+    phases, amplitudes, window = draw.randint(1, 3), draw.randint(1, 2), draw.choice((1, 3, 5, 9, 23))
+    wide = draw.choice((0.0, 0.5, 2.0, 12.0))  # of a patch, in samples of the grid
+    extent = 2 * (draw.randint(0, 8) + math.ceil((width + wide + 1) / 2))
+    samples = 2 * draw.randint(1, 20)
+    corners = (width - 1) / 2 + torch.rand(places, 2, patches, 1, dtype=torch.float64) * (extent - width - wide)
+    at = corners + wide * torch.rand(places, 2, patches, points, dtype=torch.float64)
+    rest = torch.randn(places, phases + amplitudes, patches, points, dtype=torch.float64)
+    kernel = torch.rand(draw.randint(2, 9), dtype=dtype)
+    kernel[0] = 0
+    sums = [torch.randn(places, shifts, window, samples, dtype=dtype) for _ in range(2)]
+    for part in sums:
+        part[..., : draw.randint(0, samples)] *= draw.choice((0, 1))
+    case = (
+        torch.randn(states, cells, dtype=dtype.to_complex()),
+        torch.rand(states, dtype=dtype),
+        torch.randint(cells, (patches,)),
+        torch.cat([at, rest], 1),
+        torch.randn(depths, phases, dtype=torch.float64),
+        torch.randn(depths, amplitudes, dtype=torch.float64),
+        width,
+        kernel,
+        torch.randn(samples // 2, extent // 2, dtype=dtype),
+        torch.randn(samples // 2, extent // 2, dtype=dtype),
+        *sums,
+    )
+    about = (
+        f"{dtype} states {states} cells {cells} patches {patches} points {points} places {places} depths {depths} "
+        f"shifts {shifts} width {width} extent {extent} samples {samples} window {window} wide {wide}"
+    )
+    products = places * depths * (patches * points * extent**2 + states * samples * extent * (samples + extent))
+    return case, about, products
+
+
 KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "overlap.c: gather": overlap_gather,
     "overlap.c: scatter": overlap_scatter,
@@ -594,6 +705,8 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "occlusion.c: gradient over the field": field_occlude_gradient,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
+    "scattered.c: light": scattered,
+    "scattered.c: gradient": scattered_gradient,
     "srgb.c: values": srgb,
     "srgb.c: gradient": srgb_gradient,
     "sensor.c: values": sensor,

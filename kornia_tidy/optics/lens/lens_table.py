@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import cast
 
 import torch
@@ -72,6 +72,17 @@ class LensTable:
 
         Beyond the table's range its edge stands in; the defocus of an ideal lens is not among the coefficients.
         """
+        series = self.series(heights, wavelength)
+        for name in ("wavefront", "amplitude", "illumination", "chief"):
+            of_terms = getattr(series, name).movedim(1, 0)  # (S, F, ...)
+            terms = defocus_terms(defocus, self.reach, len(of_terms)).T
+            terms = terms.reshape(*terms.shape, *[1] * (of_terms.ndim - 1))  # (S, D, 1, ...)
+            total = sum(term * own for term, own in zip(terms, of_terms, strict=True))  # alike for any number of depths
+            series = replace(series, **{name: cast("Tensor", total).movedim(0, 1)})
+        return series
+
+    def series(self, heights: Tensor, wavelength: float) -> LensSample:
+        """Return the same with the terms of :func:`~kornia_tidy.optics.lens.field_table.defocus_terms` for depths."""
         field, crowding = self.field.tolist()
         relative = (heights.double() / field).clamp(0, 1) if field else torch.zeros(len(heights), dtype=torch.float64)
         by_wave = self._wave_weights(wavelength)
@@ -82,20 +93,15 @@ class LensTable:
             odd = height_weights(mixed.shape[-2], relative, crowding, odd=True) @ mixed
             return torch.where(torch.as_tensor(parity) % 2 == 1, odd, even)
 
-        def at_defocus(table: Tensor) -> Tensor:  # (S, F, J) to (F, D, J)
-            terms = defocus_terms(defocus, self.reach, len(table)).T[..., None, None]  # (S, D, 1, 1)
-            total = sum(term * own for term, own in zip(terms, table, strict=True))  # alike for any number of depths
-            return cast("Tensor", total).movedim(0, 1)
-
         edges = self.edges.double().movedim(1, 0)  # (E, H, 2)
         centre_and_radius = torch.tensor([1, 0])
         return LensSample(
-            at_defocus(at_height(self.wavefront, _orders(self.wavefront))),
+            at_height(self.wavefront, _orders(self.wavefront)).movedim(0, 1),
             at_height(self.radial, 1 + _orders(self.radial)),
             at_height(self.tangential, 1 + _orders(self.tangential, sines=True)),
-            at_defocus(at_height(self.amplitude, _orders(self.amplitude))),
-            at_defocus(at_height(self.illumination, _orders(self.illumination))),
-            at_defocus(at_height(self.chief[..., None], 0))[..., 0],
+            at_height(self.amplitude, _orders(self.amplitude)).movedim(0, 1),
+            at_height(self.illumination, _orders(self.illumination)).movedim(0, 1),
+            at_height(self.chief[..., None], 0)[..., 0].T,
             at_height(edges[None].expand(len(self.wavelengths), -1, -1, -1), centre_and_radius).movedim(0, 1),
         )
 
