@@ -12,10 +12,13 @@
 
 #include <math.h>
 #include <stdlib.h>
+#ifdef _OPENMP
+#include <omp.h>
+#endif
 
 #include "vectors.h"
 
-enum { BLOCK = REGISTERS == 32 ? 8 : 4, SPAN = 3 };  // rows and vectors of a product that stay in registers
+enum { BLOCK = 4, SPAN = REGISTERS == 32 ? 6 : 3 };  // rows and vectors of a product that stay in registers
 enum { ROWS = 4 };                                   // of a patch: weights of points are padded to a multiple
 enum { NO_MEMORY = 1, OUTSIDE = 2 };                 // status of the functions
 
@@ -72,6 +75,14 @@ INLINE vec times_i(vec x) { return PICK(x, SWAP) * signs(); }
 
 INLINE int64_t padded(int64_t count, int64_t step) { return (count + step - 1) / step * step; }
 
+INLINE int thread_number(void) {
+#ifdef _OPENMP
+    return omp_get_thread_num();
+#else
+    return 0;
+#endif
+}
+
 // ---------------------------------------------------------------------- products with real matrices
 
 // A matrix in blocks of BLOCK rows, the last one padded with zeros, and the columns with other numbers in each block.
@@ -108,9 +119,9 @@ INLINE void add_products(const REAL *numbers, const vec *x, int64_t inner, int64
     vec sums[BLOCK][SPAN];
     memset(sums, 0, sizeof sums);
     for (int64_t i = 0; i < inner; i++, numbers += BLOCK, x += vecs)
-#pragma GCC unroll 8
+#pragma GCC unroll 4
         for (int n = 0; n < BLOCK; n++)
-#pragma GCC unroll 3
+#pragma GCC unroll 6
             for (int v = 0; v < count; v++) sums[n][v] += numbers[n] * x[v];
     for (int n = 0; n < BLOCK; n++)
         for (int v = 0; v < count; v++) out[n * vecs + v] = sums[n][v];
@@ -124,6 +135,7 @@ static void multiply(const matrix *m, const vec *x, int64_t vecs, vec *out) {
         const int64_t inner = m->after[b] - m->first[b];
         int64_t v = 0;
         for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, from + v, inner, vecs, SPAN, out + v);
+        if (SPAN > 3 && vecs - v >= 3) add_products(numbers, from + v, inner, vecs, 3, out + v), v += 3;
         if (vecs - v == 2) add_products(numbers, from + v, inner, vecs, 2, out + v);
         else if (vecs - v == 1) add_products(numbers, from + v, inner, vecs, 1, out + v);
     }
@@ -141,6 +153,8 @@ typedef struct {
     vec *column_weights;              // (patches, points, vecs), each number twice
     matrix cosines, sines, cosines_back, sines_back;
     matrix *pixels;                   // (shifts, 4): columns, rows, and the transposes
+    int64_t size;                     // vectors of a desk
+    vec *desks;                       // (threads, size)
 } work;
 
 // Finds the samples that each patch touches, as many for all. Returns whether they lie in the grid.
@@ -298,6 +312,7 @@ static void fill_grids(const work *w, const desk *d) {
     const scattered *s = w->s;
     const int64_t tall = w->tall, vecs = w->vecs, pitch = w->across * LANES, size = s->extent * pitch;
     memset(d->grids, 0, s->states * size * sizeof(REAL));
+    memset(d->light, 0, s->samples * w->along * sizeof(vec));
     for (int64_t c = 0; c < s->patches; c++) {
         spread(w, d->field, c, d->patch, d->turned);
         REAL *at = (REAL *)d->grids + w->start[2 * c] * pitch + 2 * w->start[2 * c + 1];
@@ -445,8 +460,6 @@ static int64_t share_out(const work *w, vec *memory, desk *d) {
     const scattered *s = w->s;
     const int64_t wide = w->across > w->along ? w->across : w->along, half = padded(s->extent / 2, BLOCK) * wide,
                   samples = padded(s->samples, BLOCK), transformed = padded(s->samples / 2, BLOCK) * wide;
-    vec **parts[] = {(vec **)&d->field, &d->grids, &d->patch, &d->turned, &d->sum,   &d->less,         &d->even,
-                     &d->odd,           &d->half,  &d->light, &d->lines,  &d->turned_lines, &d->pixels, &d->of_light};
     const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
                              s->states * s->extent * w->across,
                              w->rows * w->vecs,
@@ -461,23 +474,20 @@ static int64_t share_out(const work *w, vec *memory, desk *d) {
                              samples * w->beside,
                              padded(s->window, BLOCK) * w->beside,
                              samples * w->along};
-    int64_t total = 0;
-    for (int n = 0; n < 14; n++) {
-        if (memory) *parts[n] = memory + total;
-        total += sizes[n];
-    }
-    return total;
+    int64_t at[15] = {0};
+    for (int n = 0; n < 14; n++) at[n + 1] = at[n] + sizes[n];
+    if (memory)
+        *d = (desk){(REAL *)memory,  memory + at[1], memory + at[2], memory + at[3],  memory + at[4],  memory + at[5],  memory + at[6],
+                    memory + at[7],  memory + at[8], memory + at[9], memory + at[10], memory + at[11], memory + at[12], memory + at[13]};
+    return at[14];
 }
 
 // One depth of a place: its light, or the gradients, which are added to `of_waves` and `of_weights`.
-static int compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, REAL *of_weights) {
+static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, REAL *of_weights) {
     const scattered *s = w->s;
     desk own, *d = &own;
-    const int64_t size = share_out(w, 0, d), out = (place * s->depths + depth) * s->shifts * s->window * s->window;
-    vec *memory = aligned_alloc(sizeof(vec), size * sizeof(vec));
-    if (!memory) return NO_MEMORY;
-    memset(memory, 0, size * sizeof(vec));
-    share_out(w, memory, d);
+    const int64_t out = (place * s->depths + depth) * s->shifts * s->window * s->window;
+    share_out(w, w->desks + thread_number() * w->size, d);
     const int64_t rows = 2 + s->phases + s->amplitudes;
     fill_field(s, s->values + (place * rows + 2) * s->patches * s->points, depth, d->field);
     fill_grids(w, d);
@@ -492,8 +502,6 @@ static int compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, 
     }
     if (s->gradient) gather_waves(w, d, of_waves);
     else sum_pixels(w, d, s->light + out);
-    free(memory);
-    return 0;
 }
 
 static int compute_place(work *w, int64_t place, const REAL *kernel, char *matrices, REAL *parts) {
@@ -507,8 +515,11 @@ static int compute_place(work *w, int64_t place, const REAL *kernel, char *matri
     w->along = (2 * s->samples + LANES - 1) / LANES, w->beside = (s->window + LANES - 1) / LANES;
     w->row_weights = malloc(total * w->rows * sizeof(REAL));
     w->column_weights = aligned_alloc(sizeof(vec), total * w->vecs * sizeof(vec));
-    int status = w->row_weights && w->column_weights ? 0 : NO_MEMORY;
+    w->size = share_out(w, 0, 0);
+    w->desks = aligned_alloc(sizeof(vec), s->threads * w->size * sizeof(vec));
+    const int status = w->row_weights && w->column_weights && w->desks ? 0 : NO_MEMORY;
     if (!status) {
+        memset(w->desks, 0, s->threads * w->size * sizeof(vec));
         fill_weights(w, places, kernel);
         for (int64_t v = 0; v < s->shifts; v++) {
             const int64_t at = (place * s->shifts + v) * s->window * s->samples;
@@ -521,11 +532,7 @@ static int compute_place(work *w, int64_t place, const REAL *kernel, char *matri
 #pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
         for (int64_t depth = 0; depth < s->depths; depth++) {
             REAL *own = s->gradient ? parts + depth * numbers : 0;
-            const int found = compute(w, place, depth, own, s->gradient ? own + 2 * s->states * s->cells : 0);
-            if (found) {
-#pragma omp atomic write
-                status = found;
-            }
+            compute(w, place, depth, own, s->gradient ? own + 2 * s->states * s->cells : 0);
         }
         for (int64_t depth = 0; depth < s->depths && s->gradient; depth++) {
             const REAL *own = parts + depth * numbers;
@@ -533,7 +540,7 @@ static int compute_place(work *w, int64_t place, const REAL *kernel, char *matri
             for (int64_t k = 0; k < s->states; k++) s->of_weights[k] += own[2 * s->states * s->cells + k];
         }
     }
-    free(w->row_weights), free(w->column_weights);
+    free(w->row_weights), free(w->column_weights), free(w->desks);
     return status;
 }
 

@@ -25,8 +25,8 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.scattered_ops import SOURCE, Points, scattered_light, scattered_light_by_torch
 from kornia_tidy.mode import Mode, torch_mode
 
-_SIGMA = 1.6  # period of the transform over the window: light beyond it folds back outside the used part
-_DENSITY = 1.5  # samples of the intensity over those that its bandwidth needs
+_SIGMA = 1.4  # period of the transform over the window: light beyond it folds back outside the used part
+_DENSITY = 1.35  # samples of the intensity over those that its bandwidth needs
 _NODES = 96
 _STEP = 0.25  # pixels in which the largest shift is counted
 
@@ -88,11 +88,11 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
     Example:
         >>> grid = scattered_grid(0.3, 9, 1e-3)
         >>> grid.extent, 2 * len(grid.cosines), grid.sums(9, torch.zeros(2, 1)).shape
-        (28, 32, torch.Size([2, 1, 9, 32]))
+        (24, 36, torch.Size([2, 1, 9, 36]))
     """
     span = max(2 * highest, 1e-3)
-    width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH) + 1)
-    decay = -math.log(tolerance) + 1
+    width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH))
+    decay = 1 - 0.85 * math.log(tolerance)  # a pixel attenuates the spectrum's images too
     reach = math.ceil(math.hypot(decay, math.pi) / (math.pi * (1 - 1 / _DENSITY)))
     spacing = 1 / (2 * _DENSITY * span)
     half = math.ceil((window / 2 + math.ceil(shift / _STEP) * _STEP) / spacing) + reach

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import cast
 
 import torch
@@ -87,10 +88,13 @@ class LensTable:
         relative = (heights.double() / field).clamp(0, 1) if field else torch.zeros(len(heights), dtype=torch.float64)
         by_wave = self._wave_weights(wavelength)
 
+        @cache
+        def weights(count: int, odd: bool) -> Tensor:
+            return height_weights(count, relative, crowding, odd=odd)
+
         def at_height(table: Tensor, parity: Tensor | int) -> Tensor:  # (W, ..., H, J) to (..., F, J)
             mixed = torch.tensordot(by_wave, table.double(), 1)
-            even = height_weights(mixed.shape[-2], relative, crowding) @ mixed
-            odd = height_weights(mixed.shape[-2], relative, crowding, odd=True) @ mixed
+            even, odd = (weights(mixed.shape[-2], odd) @ mixed for odd in (False, True))
             return torch.where(torch.as_tensor(parity) % 2 == 1, odd, even)
 
         edges = self.edges.double().movedim(1, 0)  # (E, H, 2)
