@@ -34,7 +34,7 @@ class PSFMemory:
     of threads may ask at once; those that meet on their first capture may each compute the same.
 
     Args:
-        most_bytes: of all tensors together. What is larger is computed anew each time.
+        most_bytes: of all tensors and keys together. What is larger is computed anew each time.
 
     Example:
         >>> asked = []
@@ -54,7 +54,7 @@ class PSFMemory:
 
     def recall(
         self,
-        key: Hashable,
+        key: tuple[Hashable, ...],
         defocus: tuple[float, ...],
         make: Callable[[tuple[float, ...]], tuple[Tensor, ...]],
         form: Callable[..., Any] | None = None,
@@ -82,10 +82,9 @@ class PSFMemory:
                 # Sums are rounded in an order that follows the layout: it is the same whatever is remembered.
                 places = [nodes.index(psi) for psi in defocus]
                 found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
-                of_found = sum(tensor.nbytes for tensor in found)  # what is made of them takes as much again
-                nbytes = (
-                    sum(tensor.nbytes for tensor in tensors) + ((found is not tensors) + (form is not None)) * of_found
-                )
+                copies = (found is not tensors) + (form is not None)  # what is made of them takes as much again
+                nbytes = sum(len(value) for value in key if isinstance(value, bytes))  # of masks
+                nbytes += sum(x.nbytes for x in tensors) + copies * sum(x.nbytes for x in found)
                 known = _Remembered(nodes, tensors, (defocus, how), form(*found) if form else found, nbytes)
                 held = nbytes + sum(own.nbytes for own in list(self._held.values()))
                 for oldest in list(self._held):

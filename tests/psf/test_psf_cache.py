@@ -10,7 +10,7 @@ import torch
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.psf import exact
 from kornia_tidy.psf import psf_model as module
-from kornia_tidy.psf.psf_cache import PSFMemory
+from kornia_tidy.psf.psf_cache import PSFMemory, values_of
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=5.0)
@@ -137,10 +137,12 @@ class TestPSFMemory(BaseTester):
             return (torch.zeros(len(nodes), 5, dtype=torch.float64),)
 
         for kind in ("one", "two", "three", "one", "four", "one", "two"):
-            memory.recall(kind, (0.0,), make)
+            memory.recall((kind,), (0.0,), make)
         assert len(asked) == 5  # "two" again
-        memory.recall("five", (0.0, 1.0, 2.0, 3.0), make)
+        memory.recall(("five",), (0.0, 1.0, 2.0, 3.0), make)
         assert not memory._held  # larger than all that may be kept
+        memory.recall(values_of(torch.zeros(31)), (0.0,), make)
+        assert not memory._held  # nor masks
 
     def test_feature_what_comes_out_does_not_depend_on_what_is_remembered(self):
         def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:
@@ -155,5 +157,5 @@ class TestPSFMemory(BaseTester):
     def test_exception_nothing_is_kept_of_what_could_not_be_made(self):
         memory = PSFMemory()
         with pytest.raises(ZeroDivisionError):
-            memory.recall("one", (0.0,), lambda _: (torch.ones(1) * (1 // 0),))
+            memory.recall(("one",), (0.0,), lambda _: (torch.ones(1) * (1 // 0),))
         assert not memory._held
