@@ -82,7 +82,7 @@ def check(chromium: Any, base: str, folder: Path) -> list[str]:
     page.set_default_timeout(WAIT)
     wrong, links, anchors, pictures = [], set(), {}, 0
     page.on("pageerror", lambda error: wrong.append(f"{page.url}: {error}"))
-    page.on("response", lambda answer: answer.ok or wrong.append(f"{page.url}: {answer.url}: {answer.status}"))
+    page.on("response", lambda answer: answer.status < 400 or wrong.append(f"{answer.url}: status {answer.status}"))
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.html"))
     for name in names:
         page.goto(base + name)

@@ -88,7 +88,7 @@ def shorten_factories(
 
 def drop_dead_links_of_sources(_app: object, env: Any) -> None:
     """Drop pages of modules without source, and links of sources to descriptions that stand under another name."""
-    described = {name for name, *_ in env.get_domain("py").get_objects()}
+    described = {name for name, _, _, _, anchor, _ in env.get_domain("py").get_objects() if name == anchor}
     for module, entry in list(getattr(env, "_viewcode_modules", {}).items()):
         if not entry:
             del env._viewcode_modules[module]

@@ -145,8 +145,8 @@ def card(example: Path, pages: Path, results: Path) -> str:
     described = ast.get_docstring(ast.parse(text(example))) or ""
     lead = " ".join(described.partition("\n\n")[0].split())
     pictures = sorted((pages / "images").glob(f"{example.stem}-*.png"))
-    shown = [f":img-top: images/{pictures[0].name}"] if pictures else []
     title = TITLES.get(example.stem, example.stem.replace("_", " ").capitalize())
+    shown = [f":img-top: images/{pictures[0].name}", f":img-alt: {title}"] if pictures else []
     head = [f":::{{grid-item-card}} {title}", f":link: {example.stem}", ":link-type: doc", *shown]
     printed = results / example.stem / "printed.txt"
     lines = [] if shown or not printed.exists() else text(printed).splitlines()[:CARD_LINES]
