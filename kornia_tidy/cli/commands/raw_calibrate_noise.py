@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 
 from kornia_tidy.cli.commands.parser import Optional
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
-from kornia_tidy.cli.commands.shared import File, check_outputs
+from kornia_tidy.cli.commands.shared import File, check_outputs, picture_beside
 from kornia_tidy.settings import Unit
 
 
@@ -31,14 +31,14 @@ class CalibrateNoise:
         files: camera raw files of one camera and ISO.
         output: where the calibration goes, OUT.json.
         dark: captures without light: black is measured in them. None: black as the files say.
-        plot: draw the photon-transfer curve, without a name as OUT.png beside OUT.json. None: it is not drawn.
+        plot: picture of the photon-transfer curve. None: OUT.png, if matplotlib is installed.
         dump: layout of a headerless file.
     """
 
     files: RawFiles
     output: Annotated[str, Unit("OUT.json")]
     dark: tuple[File, ...] = ()
-    plot: Annotated[str, Optional("OUT.png")] | None = None
+    plot: Annotated[str, Optional("PNG")] | None = None
     dump: Dump = field(default_factory=Dump)
 
     notes: ClassVar = """\
@@ -48,7 +48,7 @@ In Python:
 """
     examples: ClassVar = """\
   Pairs of flats at ISO 800, with two captures under the lens cap:
-    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json --plot
+    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json
 
   From a single picture:
     kornia-tidy raw calibrate-noise street.cr2 -o noise.json
@@ -56,9 +56,13 @@ In Python:
 
     def run(self) -> None:
         """Calibrate, write the results, and print a summary."""
+        from kornia_tidy.checks import check_choice
+
         output = Path(self.output)
-        plot = None if self.plot is None else Path(self.plot or output.with_suffix(".png"))
-        _check_outputs(output, plot, [*self.files, *self.dark])
+        plot = picture_beside(self.plot, self.output)
+        if plot is not None:
+            check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))
+        check_outputs([output, plot], [*self.files, *self.dark])
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.figures.style import save_figure
         from kornia_tidy.figures.transfer import draw_transfer
@@ -72,14 +76,3 @@ In Python:
         for topic, text in result.in_words():
             tell(topic, text)
         tell("wrote", f"{output}" + (f" and {plot}" if plot else ""))
-
-
-def _check_outputs(output: Path, plot: Path | None, inputs: list[str]) -> None:
-    """Check before any work that outputs can be written and do not replace captures."""
-    if plot is not None:
-        from kornia_tidy.checks import check_choice
-        from kornia_tidy.figures.style import require_matplotlib
-
-        require_matplotlib()
-        check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))
-    check_outputs([output, plot], inputs)

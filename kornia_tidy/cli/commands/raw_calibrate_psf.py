@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from kornia_tidy.cli.commands.parser import Given
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
-from kornia_tidy.cli.commands.shared import File, SensorInElectrons, Window, check_outputs
+from kornia_tidy.cli.commands.shared import File, SensorInElectrons, Window, check_outputs, picture_beside
 from kornia_tidy.reconstruction.settings import LensSettings
 from kornia_tidy.settings import Count, Metres, Seconds, Unit
 
@@ -41,7 +41,7 @@ class CalibratePsf:
         reference: the same places with a flat mask, unsaturated. None: PSFs are centred at their centroids.
         window: side of the PSFs in pixels of the sensor.
         points: points in each picture.
-        picture: draw PSFs, uncertainties and residuals. None: they are not drawn.
+        picture: of PSFs, uncertainties and residuals. None: OUT.png, if matplotlib is installed.
         fit_mask: find the mask behind the PSFs and write its heights in metres. None: it is not searched for.
         mask_size: pixels along a side of the mask that is fitted.
         diameter: of the point of light.
@@ -93,7 +93,7 @@ In Python:
   the position of the chief ray; and retrieval of the mask behind these PSFs:
     kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
         --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \\
-        --picture bank.png --fit-mask mask.npy
+        --fit-mask mask.npy
 """
 
     def run(self) -> None:
@@ -139,23 +139,24 @@ In Python:
                 tell("mask", f"{float(distance):g} m: leaves {words} % in L1")
             write_heights(self.fit_mask, fit.lens.masks.heights().detach())
             tell("wrote", self.fit_mask)
-        if self.picture is not None:
+        if (picture := picture_beside(self.picture, self.output)) is not None:
             from kornia_tidy.figures.measured_psfs import draw_measured
             from kornia_tidy.figures.style import save_figure
 
-            save_figure(self.picture, draw_measured(measured, fit))
-            tell("wrote", self.picture)
+            save_figure(picture, draw_measured(measured, fit))
+            tell("wrote", str(picture))
 
     def _check(self) -> None:
         """Check the settings before any work."""
         from kornia_tidy.checks import check_choice
         from kornia_tidy.files import check_file
 
-        for path, suffix in ((self.output, ".safetensors"), (self.picture, ".png"), (self.fit_mask, ".npy")):
+        picture = picture_beside(self.picture, self.output)
+        for path, suffix in ((self.output, ".safetensors"), (picture, ".png"), (self.fit_mask, ".npy")):
             if path is not None:
                 check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
         inputs = [*self.files, *self.reference]
-        check_outputs([self.output, self.picture, self.fit_mask], inputs)
+        check_outputs([self.output, picture, self.fit_mask], inputs)
         if len(set(self.distances)) != len(self.distances) or not min(self.distances) > 0:
             raise ValueError(f"--distances must be different metres above zero, got {self.distances}")
         groups = len(self.distances) * len(self.exposures)

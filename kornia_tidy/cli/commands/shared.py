@@ -316,6 +316,23 @@ def check_output(path: str, *inputs: str | None, bits: int = 8) -> None:
     check_outputs([path], inputs)
 
 
+def picture_beside(picture: str | None, output: str) -> Path | None:
+    """Return where a command draws its numbers: as given, else beside its output, if matplotlib is installed.
+
+    Raises:
+        ImportError: if a picture was asked for, and matplotlib is missing.
+    """
+    from kornia_tidy.figures.style import require_matplotlib
+
+    try:
+        require_matplotlib()
+    except ImportError:
+        if picture is not None:
+            raise
+        return None
+    return Path(picture or Path(output).with_suffix(".png"))
+
+
 def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None]) -> None:
     """Check before any work that outputs can be written and do not replace inputs; None is skipped.
 

@@ -55,7 +55,7 @@ def write_dump(path, channels):
 
 class TestCalibratePSF(BaseTester):
     def test_smoke_from_images_to_a_bank_and_a_picture(self, grey, tmp_path, capsys):
-        more = ["--distances", "0.8", "0.5", "-o", "bank.safetensors", "--picture", "bank.png"]
+        more = ["--distances", "0.8", "0.5", "-o", "bank.safetensors"]
         assert main(["raw", "calibrate-psf", *grey, *NOISE, *more]) == 0
         told = capsys.readouterr()
         assert told.err == ""
