@@ -288,7 +288,7 @@ class RuledClosedForm(ClosedForm):
 
     def _camera_maps(self, capture: Tensor, noise: Tensor) -> Tensor:
         """Return maps of the camera's and each pixel's properties, (B, CAMERA_MAPS, H, W)."""
-        place = ((noise.log10() - math.log10(WIENER_NOISES[0])) / STEP).clamp(min=0)
+        place = ((noise.log10() - math.log10(WIENER_NOISES[0])) / STEP).clamp(0, len(WIENER_NOISES) - 1)
         facts = [self._left(noise, FINER + place)[..., 0, 0].log10() + 2, *(_at(table, place) for table in self.bands)]
         told = torch.cat(facts, 1).to(capture)[:, :, None, None].expand(-1, -1, *capture.shape[-2:])
         return torch.cat([(capture < CLIPPED).all(1, keepdim=True).to(capture), told], 1)

@@ -11,13 +11,14 @@ from kornia_tidy import PSFBank, SensorNoise
 from kornia_tidy.data import PHOTOGRAPHS
 from kornia_tidy.reconstruction import ClosedFormHead, RuledClosedForm, reconstruct_tiled
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
-from kornia_tidy.reconstruction.closed_form import NODES
+from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.ruled_closed_form import (
     BEFORE_BILATERAL,
     CAMERA_MAPS,
     COLORS,
     FILTERS,
+    NOISES,
     STEPS,
     band_facts,
     light_detail,
@@ -187,6 +188,13 @@ class TestRuledClosedForm(BaseTester):
         capture[0, 1, 3, 4] = 1.0
         known = ruled()(capture, 0.01).maps[:, -CAMERA_MAPS]
         assert (known == 0).nonzero().tolist() == [[0, 3, 4]]
+
+    def test_feature_of_more_noise_than_any_wiener_filter_is_for_the_last_one_leaves_a_share(self):
+        restore, capture = ruled(), photo(16, 16)
+        left = [restore(capture, noise).maps[0, 1 - CAMERA_MAPS, 0, 0] for noise in (WIENER_NOISES[-1], 0.1, 0.3)]
+        norm = restore.places[len(NOISES) - 1].square().sum((-2, -1)).mean().sqrt()
+        for noise, logarithm in zip((WIENER_NOISES[-1], 0.1, 0.3), left, strict=True):
+            self.assert_close(10 ** (logarithm - 2), noise * norm, rtol=1e-6, atol=0)
 
     def test_feature_bands_of_a_mirror_without_blur_are_whole(self):
         lost, transfer = band_facts(torch.eye(1, dtype=torch.float64).expand(NODES, 3, 1, 1))

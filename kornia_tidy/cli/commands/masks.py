@@ -116,8 +116,8 @@ class ExportMasks:
         output: a folder, or x.npy.
         material: what turns height into phase. None: as saved, or constant, index 1.5 at every wavelength.
         force: replace earlier files.
-        pupil_radius: of the pupil on the panel or the plate; the mask is 2.3 radii wide. None: on a panel the largest
-            with a whole number of panel pixels per mask pixel.
+        pupil_radius: of the pupil on the panel; the mask is 2.3 radii wide. None: the largest with a whole number of
+            panel pixels per mask pixel.
         panel: of frames.
         timing: of frames.
     """

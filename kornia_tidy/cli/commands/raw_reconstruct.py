@@ -181,9 +181,9 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
         words: dict[str, Any] = {"head": self.head or ANY_CAMERA} | (
             {"psfs": f"measured: {self.psfs}"} if self.psfs else {}
         )
-        words |= {name: str(value) for name, value in self._given().items()}
         settings = ("noise", "linear", "overlap", "orientations", "white_balance", "depth_unit")
         words["settings"] = {name: getattr(self, name) for name in settings} | {"dump": vars(self.dump)}
+        words["settings"] |= {"camera": {name: str(value) for name, value in self._given().items()}}
         used = (self.head, self.psfs, self.noise, self.masks, self.lens)
         folder = Path(self.output)
         rows = reconstruct_files(

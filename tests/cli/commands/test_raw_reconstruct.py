@@ -227,6 +227,14 @@ class TestRawReconstruct(BaseTester):
         assert ("kept" in capsys.readouterr().out) == (change == "none")
         assert (folder / "a_depth.pfm").exists()
 
+    def test_feature_resume_does_not_keep_results_of_a_camera_with_more_options(self, tmp_path, capsys):
+        files, masks = [capture(tmp_path / "a.png", size=(40, 48))], tmp_path / "heights.npy"
+        np.save(masks, np.zeros((1, 23, 23), np.float32))
+        camera = ["--masks", str(masks), "--noise", "0.01", "--resume"]
+        for options, kept in ((["--f-number", "20"], False), ([], False), ([], True)):
+            assert reconstruct(files, "wiener", tmp_path / "out", *camera, *options) == 0
+            assert ("kept" in capsys.readouterr().out) == kept
+
     @pytest.mark.takes_seconds
     def test_feature_a_network_that_comes_with_the_library_needs_no_checkpoint(self, tmp_path, capsys):
         (tmp_path / "a.dng").write_bytes(raw_file())
