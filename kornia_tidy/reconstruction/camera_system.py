@@ -32,14 +32,14 @@ def any_camera_system(
         optics: the camera, of any masks, lens and sensor; it is not changed. Behind a real lens the PSFs are those of
             the field's centre, and :func:`~kornia_tidy.reconstruction.light_head.reconstruct_light` takes those of each
             place. Or the PSFs of a camera, of one or three colours.
-        sensor: by whose noise captures are restored. Default: the camera's.
+        sensor: its noise is that of the captures. Default: the camera's.
         head: one of :data:`~kornia_tidy.reconstruction.head_names.CLOSED_FORMS`, which has the network.
 
     Returns:
         The system, for captures encoded as sRGB. Its settings tell of the head only.
 
     Raises:
-        ValueError: if neither is a sensor there, or the head is another, or PSFs are those of one depth.
+        ValueError: if neither camera nor arguments have a sensor, the head is unknown, or the PSFs have only one depth.
 
     Example:
         >>> system = any_camera_system(TiDyOptics(fidelity="draft"))
@@ -69,11 +69,11 @@ def saved_system(path: str | os.PathLike[str], sensor: SensorNoise | None = None
     Args:
         path: checkpoint of ``kornia-tidy train``, or a camera's state, as
             :func:`~kornia_tidy.reconstruction.trained.load_camera` reads it.
-        sensor: of a camera, in place of its own.
+        sensor: replaces that of a camera.
 
     Raises:
         FileNotFoundError: if there is no file.
-        ValueError: if it is damaged, or holds masks alone.
+        ValueError: if it is damaged, or holds only masks.
     """
     if EXTRA_STATE not in read_tensors(path, WHAT)[0]:
         return load_trained(path)
