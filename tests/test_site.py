@@ -76,7 +76,7 @@ class TestGallery(BaseTester):
         assert [name for name, _ in pictures] == ([picture] if picture else [])
         assert all(read_image(tmp_path / "pages" / file).shape[0] == 3 for _, file in pictures)
         card = [":::{grid-item-card} My example", ":link: my_example", ":link-type: doc"]
-        card += [f":img-top: images/my_example-{name}.png" for name, _ in pictures]
+        card += [f":img-top: images/my_example-{name}.png\n:img-alt: My example" for name, _ in pictures]
         instead = [] if pictures else ["```text", "arguments []", "```"]
         index = (tmp_path / "pages" / "index.md").read_text(encoding="utf-8")
         assert "\n".join([*card, "", "A question. Two sentences.", *instead, ":::"]) in index
