@@ -73,7 +73,7 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     if alike or _is_compiled(light, defocus, bank, field, rendering):
         psfs = bank.with_all_light().psfs if occludes else bank.psfs  # which it divides by
         given = light, defocus, bank.defocus, psfs[0] if alike else psfs, None
-        whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus, bank.light))))
+        whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus))))
         with torch.set_grad_enabled(whole and torch.is_grad_enabled()):
             tiled = render_layers(*given, **asdict(rendering), field=None if alike else field)
         if whole:
