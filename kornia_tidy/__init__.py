@@ -71,7 +71,7 @@ _MODULES = {
     "sensor.sensor": ("SensorNoise",),
 }
 __getattr__ = importer(__name__, _MODULES)
-sys.meta_path.append(MovedModules())
+sys.meta_path.insert(0, MovedModules())
 
 
 def __dir__() -> list[str]:

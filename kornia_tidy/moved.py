@@ -46,7 +46,10 @@ def new_name(old: str) -> str | None:
 
 
 class MovedModules(MetaPathFinder, Loader):
-    """Finder of modules by their old names. Python asks it after all other finders have found nothing."""
+    """Finder of modules by their old names.
+
+    Python asks it first: the finder of files would load a module inside a package that moved a second time.
+    """
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -55,9 +58,10 @@ class MovedModules(MetaPathFinder, Loader):
         return None if new_name(fullname) is None else ModuleSpec(fullname, self, is_package=True)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Put the moved module itself in the place of the empty one, and warn."""
+        """Put the moved module itself in the place of the empty one, and warn of the names in :data:`MOVED`."""
         old = module.__name__
         new = new_name(old)
         assert new is not None
         sys.modules[old] = import_module(new)
-        warnings.warn(f"{old} is now {new}", FutureWarning, stacklevel=2)
+        if old.partition(".")[2] in MOVED:
+            warnings.warn(f"{old} is now {new}", FutureWarning, stacklevel=2)

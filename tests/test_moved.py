@@ -19,8 +19,10 @@ class TestMoved:
         assert found is importlib.import_module(new)
         assert found.__spec__.name == new
 
-    def test_feature_a_module_inside_is_imported_once(self):
-        code = "import kornia_tidy.raw.color as old; import kornia_tidy.lab.raw.color as new; print(old is new)"
+    @pytest.mark.parametrize("names", [("raw", "lab.raw"), ("lab.raw", "raw")])
+    def test_feature_a_module_inside_is_imported_once(self, names):
+        one, two = (f"import_module('kornia_tidy.{name}.color')" for name in names)
+        code = f"from importlib import import_module; print({one} is {two})"
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert said.stdout == "True\n"
         assert said.stderr.count("FutureWarning") == 1

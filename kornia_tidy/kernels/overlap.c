@@ -17,9 +17,6 @@
 
 #include <math.h>
 #include <stdlib.h>
-#ifdef _OPENMP
-#include <omp.h>
-#endif
 #ifdef __linux__
 #include <sys/mman.h>
 #endif
@@ -177,24 +174,10 @@ static REAL *plan(transform *t, int64_t length, REAL *memory) {
 
 // ---------------------------------------------------------------------- rows to lanes
 
-#define IS_float 1
-#define IS_double 0
-#define JOINED(a, b) a##b
-#define IS(type) JOINED(IS_, type)
 #define PART (VECTOR_BYTES < 32 ? VECTOR_BYTES : 32)
 
 enum { PIECE = PART / sizeof(REAL), PIECES = LANES / PIECE };
 typedef REAL part __attribute__((vector_size(PART), may_alias));
-
-#if defined(__clang__) || __GNUC__ >= 12
-#define PICK(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#elif IS(REAL)
-typedef int32_t places __attribute__((vector_size(PART)));
-#define PICK(a, b, ...) __builtin_shuffle(a, b, (places){__VA_ARGS__})
-#else
-typedef int64_t places __attribute__((vector_size(PART)));
-#define PICK(a, b, ...) __builtin_shuffle(a, b, (places){__VA_ARGS__})
-#endif
 
 // Exchanges the upper right and the lower left of every square of 2 * half x 2 * half numbers.
 #define EXCHANGE(x, half, first, second)                       \
@@ -234,14 +217,6 @@ INLINE void transpose(const wave *from, wave *to) {
 }
 
 // ---------------------------------------------------------------------- windows
-
-INLINE int thread_number(void) {
-#ifdef _OPENMP
-    return omp_get_thread_num();
-#else
-    return 0;
-#endif
-}
 
 // What all windows of one call share.
 typedef struct {

@@ -81,7 +81,7 @@ def of_axis(psfs: Tensor, places: list[Tensor]) -> Tensor:
 def parameters_of(
     places: list[Tensor], size: tuple[int, int], most: tuple[int, int], dtype: torch.dtype
 ) -> tuple[dict[str, int], dict[str, Tensor]]:
-    """Return the numbers and the tensors of the struct.
+    """Return the numbers and the tensors of the struct, edges in int64 and the rest in the data type of the PSFs.
 
     Args:
         places: :class:`Places`, checked.
@@ -90,6 +90,7 @@ def parameters_of(
         dtype: of the PSFs.
 
     Raises:
+        TypeError: if edges are not int64.
         ValueError: if tiles do not cover the pixels or are too large.
     """
     given = Places(*places)
@@ -97,11 +98,13 @@ def parameters_of(
         _check_edges(edges, pixels, largest)
     numbers = {"node_rows": given.row_weights.shape[-1], "node_columns": given.column_weights.shape[-1]}
     numbers |= {"down": len(given.row_middles), "across": len(given.column_middles)}
-    return numbers, {name: x if x.dtype == torch.int64 else x.to(dtype) for name, x in given._asdict().items()}
+    return numbers, {name: x if name.endswith("edges") else x.to(dtype) for name, x in given._asdict().items()}
 
 
 def _check_edges(edges: Tensor, pixels: int, largest: int) -> None:
     """Refuse tiles that do not cover the pixels of an axis or do not fit into windows."""
+    if edges.dtype != torch.int64:
+        raise TypeError(f"edges of tiles must be int64, got {edges.dtype}")
     tiles = edges.diff()
     if edges[0] != 0 or edges[-1] != pixels or tiles.min() < 1 or tiles.max() > largest:
         raise ValueError(

@@ -12,9 +12,6 @@
 
 #include <math.h>
 #include <stdlib.h>
-#ifdef _OPENMP
-#include <omp.h>
-#endif
 
 #include "vectors.h"
 
@@ -29,7 +26,7 @@ typedef struct {
     const int64_t *cell;                          // (patches,)
     const double *values;                         // (places, 2 + phases + amplitudes, patches, points)
     const double *phase_terms, *amplitude_terms;  // (depths, phases), (depths, amplitudes)
-    const double *kernel;                         // (degree + 1,)
+    const REAL *kernel;                           // (degree + 1,)
     const REAL *waves, *weights;                  // (states, cells) complex, (states,)
     const REAL *cosines, *sines;                  // (samples / 2, extent / 2)
     const REAL *rows, *columns;                   // (places, shifts, window, samples)
@@ -37,31 +34,6 @@ typedef struct {
     REAL *light;                                  // like gradient
     REAL *of_waves, *of_weights;                  // gradients: like waves and weights, zeros
 } scattered;
-
-#define IS_float 1
-#define IS_double 0
-#define JOINED(a, b) a##b
-#define IS(type) JOINED(IS_, type)
-
-#if VECTOR_BYTES == 64 && IS(REAL)
-#define PAIR 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1
-#define SWAP 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14
-#elif VECTOR_BYTES == 64 || (VECTOR_BYTES == 32 && IS(REAL))
-#define PAIR 0, 1, 0, 1, 0, 1, 0, 1
-#define SWAP 1, 0, 3, 2, 5, 4, 7, 6
-#elif VECTOR_BYTES == 32 || IS(REAL)
-#define PAIR 0, 1, 0, 1
-#define SWAP 1, 0, 3, 2
-#else
-#define PAIR 0, 1
-#define SWAP 1, 0
-#endif
-
-#if defined(__clang__) || __GNUC__ >= 12
-#define PICK(x, ...) __builtin_shufflevector(x, x, __VA_ARGS__)
-#else
-#define PICK(x, ...) __builtin_shuffle(x, (bits){__VA_ARGS__})
-#endif
 
 // -1 and 1 by turns.
 INLINE vec signs(void) {
@@ -71,17 +43,9 @@ INLINE vec signs(void) {
 }
 
 // Interleaved complex numbers times i.
-INLINE vec times_i(vec x) { return PICK(x, SWAP) * signs(); }
+INLINE vec times_i(vec x) { return PICK(x, x, SWAP) * signs(); }
 
 INLINE int64_t padded(int64_t count, int64_t step) { return (count + step - 1) / step * step; }
-
-INLINE int thread_number(void) {
-#ifdef _OPENMP
-    return omp_get_thread_num();
-#else
-    return 0;
-#endif
-}
 
 // ---------------------------------------------------------------------- products with real matrices
 
@@ -181,28 +145,28 @@ static int find_patches(work *w, const double *places) {
 }
 
 // The kernel at samples so far from a point.
-INLINE vec spread_kernel(const scattered *s, const REAL *kernel, vec away) {
+INLINE vec spread_kernel(const scattered *s, vec away) {
     const vec x = away * (REAL)(2 / (double)s->width), u = 1 - x * x;
-    vec sum = all(kernel[s->degree]);
-    for (int64_t n = s->degree - 1; n >= 0; n--) sum = sum * u + kernel[n];
-    return choose(u > 0, sum, (vec){0});
+    vec sum = all(s->kernel[s->degree]);
+    for (int64_t n = s->degree - 1; n >= 0; n--) sum = sum * u + s->kernel[n];
+    return where(u > 0, sum);
 }
 
-static void fill_weights(work *w, const double *places, const REAL *kernel) {
+static void fill_weights(work *w, const double *places) {
     const scattered *s = w->s;
-    vec lanes, halves;
-    for (int i = 0; i < LANES; i++) lanes[i] = i, halves[i] = i / 2;
+    vec halves;
+    for (int i = 0; i < LANES; i++) halves[i] = i / 2;
 #pragma omp parallel for num_threads(s->threads)
     for (int64_t c = 0; c < s->patches; c++)
         for (int64_t i = c * s->points; i < (c + 1) * s->points; i++) {
             const REAL row = (REAL)(places[i] - (double)w->start[2 * c]);
             const REAL column = (REAL)(places[s->patches * s->points + i] - (double)w->start[2 * c + 1]);
             for (int64_t t = 0; t < w->rows; t += LANES) {
-                const vec x = spread_kernel(s, kernel, lanes + ((REAL)t - row));
+                const vec x = spread_kernel(s, steps() + ((REAL)t - row));
                 memcpy(w->row_weights + i * w->rows + t, &x, least(LANES, w->rows - t) * sizeof(REAL));
             }
             for (int64_t v = 0; v < w->vecs; v++)
-                w->column_weights[i * w->vecs + v] = spread_kernel(s, kernel, halves + ((REAL)(v * (LANES / 2)) - column));
+                w->column_weights[i * w->vecs + v] = spread_kernel(s, halves + ((REAL)(v * (LANES / 2)) - column));
         }
 }
 
@@ -253,7 +217,7 @@ INLINE void spread_rows(const work *w, const REAL *field, int64_t first, int row
     vec sums[2 * ROWS][2];
     memset(sums, 0, sizeof sums);
     for (int64_t i = 0; i < w->s->points; i++, down += w->rows, right += w->vecs) {
-        const vec pair = *(const loose *)(field + 2 * (first + i)), both = PICK(pair, PAIR);
+        const vec pair = *(const loose *)(field + 2 * (first + i)), both = PICK(pair, pair, PAIR);
 #pragma GCC unroll 2
         for (int v = 0; v < count; v++) {
             const vec x = both * right[v];
@@ -504,7 +468,7 @@ static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves,
     else sum_pixels(w, d, s->light + out);
 }
 
-static int compute_place(work *w, int64_t place, const REAL *kernel, char *matrices, REAL *parts) {
+static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     const scattered *s = w->s;
     const int64_t total = s->patches * s->points;
     const double *places = s->values + place * (2 + s->phases + s->amplitudes) * total;
@@ -520,7 +484,7 @@ static int compute_place(work *w, int64_t place, const REAL *kernel, char *matri
     const int status = w->row_weights && w->column_weights && w->desks ? 0 : NO_MEMORY;
     if (!status) {
         memset(w->desks, 0, s->threads * w->size * sizeof(vec));
-        fill_weights(w, places, kernel);
+        fill_weights(w, places);
         for (int64_t v = 0; v < s->shifts; v++) {
             const int64_t at = (place * s->shifts + v) * s->window * s->samples;
             for (int n = 0; n < 4; n++)
@@ -554,17 +518,15 @@ int scattered_light(const scattered *s) {
     char *matrices = malloc(tables + pixels);
     w->start = malloc(2 * s->patches * sizeof(int64_t) + 1);
     w->pixels = malloc(4 * s->shifts * sizeof(matrix) + 1);
-    REAL *kernel = malloc((s->degree + 1) * sizeof(REAL));
     REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->cells + 1) * sizeof(REAL) + 1) : 0;
-    int status = matrices && w->start && w->pixels && kernel && (parts || !s->gradient) ? 0 : NO_MEMORY;
+    int status = matrices && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
     if (!status) {
-        for (int64_t n = 0; n <= s->degree; n++) kernel[n] = (REAL)s->kernel[n];
         char *rest = lay_out(&w->cosines, s->cosines, half, spread, 0, matrices);
         rest = lay_out(&w->sines, s->sines, half, spread, 0, rest);
         rest = lay_out(&w->cosines_back, s->cosines, spread, half, 1, rest);
         rest = lay_out(&w->sines_back, s->sines, spread, half, 1, rest);
-        for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(w, place, kernel, rest, parts);
+        for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(w, place, rest, parts);
     }
-    free(matrices), free(w->start), free(w->pixels), free(kernel), free(parts);
+    free(matrices), free(w->start), free(w->pixels), free(parts);
     return status;
 }

@@ -172,9 +172,10 @@ def _new_light(
     for name, part in {"rows": rows, "columns": columns}.items():
         if part.dtype != real:
             raise TypeError(f"{name} must be of the waves' real dtype {real}, got {part.dtype}")
-    for name, part in {"values": values, "phase_terms": phase_terms, "amplitude_terms": amplitude_terms}.items():
-        if part.dtype != torch.float64:
-            raise TypeError(f"{name} must be float64, got {part.dtype}")
+    terms = {"cell": cell, "values": values, "phase_terms": phase_terms, "amplitude_terms": amplitude_terms}
+    for name, part in terms.items():
+        if part.dtype != (kind := torch.int64 if part is cell else torch.float64):
+            raise TypeError(f"{name} must be {str(kind).removeprefix('torch.')}, got {part.dtype}")
     if waves.ndim != 2 or tuple(weights.shape) != tuple(waves.shape[:1]):
         shapes = tuple(waves.shape), tuple(weights.shape)
         raise ValueError(f"waves and weights must have shapes (K, N) and (K,), got {shapes[0]} and {shapes[1]}")
@@ -182,7 +183,11 @@ def _new_light(
     expected = len(rows), 2 + phases + amplitude_terms.shape[1], *cell.shape
     if values.ndim != 4 or tuple(values.shape[:3]) != expected or len(amplitude_terms) != depths:
         raise ValueError(f"values must have shape {(*expected, 'S')} for the terms, got {tuple(values.shape)}")
-    if cosines.ndim != 2 or cosines.shape != sines.shape or kernel.ndim != 1 or width < 1:
+    if kernel.ndim != 1 or not len(kernel) or width < 1:
+        raise ValueError(
+            f"kernel must have shape (n,) and a width of at least 1, got {tuple(kernel.shape)} and a width of {width}"
+        )
+    if cosines.ndim != 2 or cosines.shape != sines.shape:
         raise ValueError(f"cosines and sines must have one shape, got {tuple(cosines.shape)} and {tuple(sines.shape)}")
     if rows.ndim != 4 or rows.shape != columns.shape or rows.shape[3] != 2 * len(cosines):
         raise ValueError(
@@ -242,7 +247,7 @@ def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
         values=values,
         phase_terms=phase_terms,
         amplitude_terms=amplitude_terms,
-        kernel=kernel.double(),
+        kernel=kernel,
         waves=waves.resolve_conj(),
         weights=weights.resolve_neg(),
         cosines=cosines,
@@ -272,7 +277,8 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         return *torch.ops.kornia_tidy.scattered_light_gradients(waves, weights, *given, gradient), *rest
     own = waves.view_as(waves), weights.view_as(weights)  # the gradients are differentiated in turn
     light = scattered_light_by_torch(*own, Points(*given[:4]), *given[4:])
-    return *torch.autograd.grad(light, own, gradient, create_graph=True), *rest
+    found = iter(torch.autograd.grad(light, [x for x in own if x.requires_grad], gradient, create_graph=True))
+    return *(next(found) if x.requires_grad else None for x in own), *rest
 
 
 _GIVEN = (

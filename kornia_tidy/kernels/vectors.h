@@ -2,6 +2,9 @@
 
 #include <stdint.h>
 #include <string.h>
+#ifdef _OPENMP
+#include <omp.h>
+#endif
 
 #ifdef __AVX512F__
 #define VECTOR_BYTES 64
@@ -39,6 +42,42 @@ INLINE vec steps(void) {
     for (int i = 0; i < LANES; i++) x[i] = i;
     return x;
 }
+
+INLINE int thread_number(void) {
+#ifdef _OPENMP
+    return omp_get_thread_num();
+#else
+    return 0;
+#endif
+}
+
+// Conditions of the preprocessor on the type of numbers, which it knows only by name: 1 or 0.
+#define IS_float 1
+#define IS_double 0
+#define JOINED(a, b) a##b
+#define IS(type) JOINED(IS_, type)
+
+// Numbers of two vectors of one type, by their places in the first and, further on, in the second.
+#if defined(__clang__) || __GNUC__ >= 12
+#define PICK(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define PICK(a, b, ...) __builtin_shuffle(a, b, (lane __attribute__((vector_size(sizeof(a))))){__VA_ARGS__})
+#endif
+
+// For PICK: a vector's first two numbers by turns, and neighbours that change places.
+#if VECTOR_BYTES == 64 && IS(REAL)
+#define PAIR 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1, 0, 1
+#define SWAP 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14
+#elif VECTOR_BYTES == 64 || (VECTOR_BYTES == 32 && IS(REAL))
+#define PAIR 0, 1, 0, 1, 0, 1, 0, 1
+#define SWAP 1, 0, 3, 2, 5, 4, 7, 6
+#elif VECTOR_BYTES == 32 || IS(REAL)
+#define PAIR 0, 1, 0, 1
+#define SWAP 1, 0, 3, 2
+#else
+#define PAIR 0, 1
+#define SWAP 1, 0
+#endif
 
 INLINE bits bits_of(vec x) {
     bits same;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import weakref
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Hashable
@@ -87,7 +88,7 @@ class PSFMemory:
                 nbytes += sum(x.nbytes for x in tensors) + copies * sum(x.nbytes for x in found)
                 known = _Remembered(nodes, tensors, (defocus, how), form(*found) if form else found, nbytes)
                 held = nbytes + sum(own.nbytes for own in list(self._held.values()))
-                for oldest in list(self._held):
+                for oldest in list(self._held) if nbytes <= self.most_bytes else ():
                     if held > self.most_bytes and (own := self._held.pop(oldest, None)) is not None:
                         held -= own.nbytes
             if known.nbytes <= self.most_bytes:
@@ -112,7 +113,8 @@ def values_of(*parts: object) -> tuple[Hashable, ...]:
     found: list[Hashable] = []
     for part in parts:
         if isinstance(part, Tensor):
-            found += part.dtype, part.device, tuple(part.shape), part.detach().cpu().numpy().tobytes()
+            bits = part.detach().cpu().contiguous().view(-1).view(torch.uint8)  # NumPy does not have all data types
+            found += part.dtype, part.device, tuple(part.shape), bits.numpy().tobytes()
         elif isinstance(part, nn.Module):
             found.append(weakref.ref(part))
             for module in part.modules():
@@ -120,10 +122,22 @@ def values_of(*parts: object) -> tuple[Hashable, ...]:
                 for name, value in vars(module).items():
                     if name not in _OF_EVERY_MODULE:
                         plain = value.tolist() if hasattr(value, "tolist") else value
-                        found += name, repr(plain) if isinstance(plain, (list, dict, set)) else plain
+                        found += name, _hashable(plain)
         else:
             found.append(cast("Hashable", part))
     return tuple(found)
+
+
+def _hashable(value: object) -> Hashable:
+    """Return a value that can be a key, in place of a list or a user's own class."""
+    try:
+        hash(value)
+    except TypeError:
+        try:
+            return pickle.dumps(value)
+        except (pickle.PicklingError, AttributeError, TypeError):  # such as a lambda
+            return repr(value)
+    return cast("Hashable", value)
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:

@@ -66,7 +66,7 @@ def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, r
     psi = optics.defocus(depth)
     field = optics.psf_model.field_of(size)
     assert field is not None
-    bank = optics.psf_model.scene_field_bank(3, image.dtype, psi, field)
+    bank = optics.psf_model.scene_bank(3, image.dtype, psi, field=field)
     grid = tuple(max(1, round(side / CELL)) for side in size)
     middles = [[(2 * i + 1) * side / (2 * n) - 0.5 for i in range(n)] for side, n in zip(size, grid, strict=True)]
     cells = torch.stack([bank.between(field, (y, x)).psfs for y in middles[0] for x in middles[1]])

@@ -59,6 +59,14 @@ class TestScatteredLight(OperatorTester):
         assert torch.autograd.gradgradcheck(light, own, fast_mode=True)
 
     @needs_compiler
+    @pytest.mark.parametrize("learnt", [0, 1])
+    def test_gradcheck_twice_of_one_argument(self, learnt):
+        case = next(case for case in map(a_case, range(20)) if case[3].shape[2] * case[10].numel() < 500)
+        own = case[learnt].requires_grad_()
+        light = lambda x: called(scattered_light, (*case[:learnt], x, *case[learnt + 1 :]))  # noqa: E731
+        assert torch.autograd.gradgradcheck(light, own, fast_mode=True)
+
+    @needs_compiler
     def test_feature_threads_and_depths_leave_every_bit(self):
         case = next(case for case in (a_case(seed, torch.float32) for seed in range(20)) if len(case[4]) == 3)
         before, found = torch.get_num_threads(), []
@@ -82,6 +90,8 @@ class TestScatteredLight(OperatorTester):
             (8, lambda x: x.float(), TypeError, "cosines must be of the waves' real dtype"),
             (11, lambda x: x.float(), TypeError, "columns must be of the waves' real dtype"),
             (3, lambda x: x.float(), TypeError, "values must be float64, got torch.float32"),
+            (2, lambda x: x.int(), TypeError, "cell must be int64, got torch.int32"),
+            (7, lambda x: x[:0], ValueError, r"kernel must have shape \(n,\) and a width of at least 1, got \(0,\)"),
             (1, lambda x: x.repeat(2), ValueError, r"waves and weights must have shapes \(K, N\) and \(K,\), got"),
             (3, lambda x: x[:, 1:], ValueError, "values must have shape .* for the terms, got"),
             (9, lambda x: x[1:], ValueError, "cosines and sines must have one shape, got"),

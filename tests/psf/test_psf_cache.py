@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from torch import nn
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.psf import exact
@@ -139,10 +140,25 @@ class TestPSFMemory(BaseTester):
         for kind in ("one", "two", "three", "one", "four", "one", "two"):
             memory.recall((kind,), (0.0,), make)
         assert len(asked) == 5  # "two" again
-        memory.recall(("five",), (0.0, 1.0, 2.0, 3.0), make)
-        assert not memory._held  # larger than all that may be kept
-        memory.recall(values_of(torch.zeros(31)), (0.0,), make)
-        assert not memory._held  # nor masks
+        kept = [*memory._held]
+        memory.recall(("five",), (0.0, 1.0, 2.0, 3.0), make)  # larger than all that may be kept
+        memory.recall(values_of(torch.zeros(31)), (0.0,), make)  # so are masks
+        assert [*memory._held] == kept  # and nothing goes for them
+
+    def test_feature_values_of_attributes_that_have_no_hash_are_told_apart(self):
+        masks, table = PixelwiseMask(1), torch.ones(2)
+        seen = []
+        for change in (0.0, 1e-6):
+            masks.table = {"settings": [table + change, (1, [2])]}
+            seen.append(values_of(masks))
+        assert len(set(seen)) == 2
+
+    @torch.no_grad()
+    @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16, torch.float64])
+    def test_feature_a_learnable_aperture_in_any_dtype(self, kind):
+        optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=SMALL, aperture=nn.Parameter(torch.ones(23, 23)))
+        image, depth = torch.rand(1, 3, 16, 16), torch.full((1, 1, 16, 16), 0.5)
+        assert optics.to(kind)(image, depth).isfinite().all()
 
     def test_feature_what_comes_out_does_not_depend_on_what_is_remembered(self):
         def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:

@@ -108,7 +108,7 @@ class TestThereAndBack(BaseTester):
         self.assert_close(found.mean(), read_image("image.png").mean(), rtol=0, atol=0.05)
         assert main([*command, "--resume"]) == 0
         assert "kept" in capsys.readouterr().out
-        assert json.loads((scene / "sharp" / "shot.json").read_text())["lens"] == lens
+        assert json.loads((scene / "sharp" / "shot.json").read_text())["settings"]["camera"]["lens"] == lens
 
     def test_feature_the_lens_is_traced_to_the_corner_of_the_first_file_that_is_there(self, scene, capsys):
         write_image("wide.png", torch.rand(3, 40, 1800))
