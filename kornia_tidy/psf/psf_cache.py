@@ -122,22 +122,22 @@ def values_of(*parts: object) -> tuple[Hashable, ...]:
                 for name, value in vars(module).items():
                     if name not in _OF_EVERY_MODULE:
                         plain = value.tolist() if hasattr(value, "tolist") else value
-                        found += name, _hashable(plain)
+                        try:
+                            hash(plain)
+                        except TypeError:  # a list, or a user's own class
+                            plain = _hashable(plain)
+                        found += name, plain
         else:
             found.append(cast("Hashable", part))
     return tuple(found)
 
 
 def _hashable(value: object) -> Hashable:
-    """Return a value that can be a key, in place of a list or a user's own class."""
+    """Return a key in the place of a value that has no hash."""
     try:
-        hash(value)
-    except TypeError:
-        try:
-            return pickle.dumps(value)
-        except (pickle.PicklingError, AttributeError, TypeError):  # such as a lambda
-            return repr(value)
-    return cast("Hashable", value)
+        return pickle.dumps(value)
+    except (pickle.PicklingError, AttributeError, TypeError):  # such as a lambda
+        return repr(value)
 
 
 def nodes_around(nodes: tuple[float, ...], defocus: Tensor) -> tuple[float, ...]:
