@@ -21,8 +21,7 @@ from kornia_tidy.sensor.exposure import electrons_at
 DOTS_PER_INCH = 150
 TITLE = "Phase masks in a wide aperture, or a lens that is stopped down"
 CAPTION = (
-    "The shutter stays open while the masks follow one another. The upper capture is taken with the first mask alone. "
-    "Each PSF is drawn on its own scale, as the root of its light."
+    "The upper capture is taken with only the first mask. Each PSF is drawn on its own scale, as the root of its light."
 )
 
 

@@ -42,16 +42,24 @@ class Points(NamedTuple):
     amplitude_terms: Tensor
 
 
+class Transform(NamedTuple):
+    """Kernel that spreads points on a grid, and the transform T of the grid, split by its symmetry.
+
+    Args:
+        width: of the kernel in samples of the grid.
+        kernel: its value as a polynomial in :math:`1 - t^2`, with t from -1 to 1 over its width, (n,).
+        cosines: real part of T for sums of rows of the grid that lie mirrored about its middle, (Q / 2, M / 2).
+        sines: imaginary part of T for their differences, negative.
+    """
+
+    width: int
+    kernel: Tensor
+    cosines: Tensor
+    sines: Tensor
+
+
 def scattered_light(
-    waves: Tensor,
-    weights: Tensor,
-    points: Points,
-    width: int,
-    kernel: Tensor,
-    cosines: Tensor,
-    sines: Tensor,
-    rows: Tensor,
-    columns: Tensor,
+    waves: Tensor, weights: Tensor, points: Points, transform: Transform, rows: Tensor, columns: Tensor
 ) -> Tensor:
     r"""Return the light in the pixels of a sensor: operator ``kornia_tidy::scattered_light``.
 
@@ -59,10 +67,7 @@ def scattered_light(
         waves: u, (K, N) complex64 or complex128 on a processor.
         weights: w, (K,), of the waves' real dtype.
         points: a, y and x of the points.
-        width: of the kernel in samples of the grid.
-        kernel: its value as a polynomial in :math:`1 - t^2`, with t from -1 to 1 over its width, (n,).
-        cosines: real part of T for sums of rows of the grid that lie mirrored about its middle, (Q / 2, M / 2).
-        sines: imaginary part of T for their differences, negative.
+        transform: kernel and T.
         rows: R, (F, V, P, Q).
         columns: C, (F, V, P, Q).
 
@@ -75,21 +80,14 @@ def scattered_light(
         MemoryError: if memory for the grids is missing.
         NotBuiltError: if the source cannot be compiled.
     """
-    return torch.ops.kornia_tidy.scattered_light(waves, weights, *points, width, kernel, cosines, sines, rows, columns)
+    return torch.ops.kornia_tidy.scattered_light(waves, weights, *points, *transform, rows, columns)
 
 
 def scattered_light_by_torch(
-    waves: Tensor,
-    weights: Tensor,
-    points: Points,
-    width: int,
-    kernel: Tensor,
-    cosines: Tensor,
-    sines: Tensor,
-    rows: Tensor,
-    columns: Tensor,
+    waves: Tensor, weights: Tensor, points: Points, transform: Transform, rows: Tensor, columns: Tensor
 ) -> Tensor:
     """Return the same by plain operations, on any device, see :func:`scattered_light`."""
+    width, kernel, cosines, sines = transform
     extent, found = 2 * cosines.shape[1], []
     own, phases = waves[:, points.cell], points.phase_terms.shape[1]
     for values, down, right in zip(points.values, rows, columns, strict=True):
@@ -166,10 +164,15 @@ def _new_light(
     if waves.dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"waves must be complex64 or complex128, got {waves.dtype}")
     real = waves.dtype.to_real()
-    for name, part in {"weights": weights, "kernel": kernel, "cosines": cosines, "sines": sines}.items():
-        if part.dtype != real:
-            raise TypeError(f"{name} must be of the waves' real dtype {real}, got {part.dtype}")
-    for name, part in {"rows": rows, "columns": columns}.items():
+    tables = {
+        "weights": weights,
+        "kernel": kernel,
+        "cosines": cosines,
+        "sines": sines,
+        "rows": rows,
+        "columns": columns,
+    }
+    for name, part in tables.items():
         if part.dtype != real:
             raise TypeError(f"{name} must be of the waves' real dtype {real}, got {part.dtype}")
     terms = {"cell": cell, "values": values, "phase_terms": phase_terms, "amplitude_terms": amplitude_terms}
@@ -276,7 +279,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     if not torch.is_grad_enabled():
         return *torch.ops.kornia_tidy.scattered_light_gradients(waves, weights, *given, gradient), *rest
     own = waves.view_as(waves), weights.view_as(weights)  # the gradients are differentiated in turn
-    light = scattered_light_by_torch(*own, Points(*given[:4]), *given[4:])
+    light = scattered_light_by_torch(*own, Points(*given[:4]), Transform(*given[4:8]), *given[8:])
     found = iter(torch.autograd.grad(light, [x for x in own if x.requires_grad], gradient, create_graph=True))
     return *(next(found) if x.requires_grad else None for x in own), *rest
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, overload
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -15,18 +15,12 @@ from kornia_tidy.search_path import import_installed
 HOLES = ("error", "fill")  # how a camera and its adapters treat holes
 _UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)  # types that torch stores, and neither compares nor gathers
 
+Depth = TypeVar("Depth", Tensor, np.ndarray)
+
 torch.library.define("kornia_tidy::nearest_known", "(Tensor known) -> Tensor")
 
 
-@overload
-def fill_holes(depth: Tensor) -> tuple[Tensor, Tensor]: ...
-
-
-@overload
-def fill_holes(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
-
-
-def fill_holes(depth: Tensor | np.ndarray) -> tuple[Tensor, Tensor] | tuple[np.ndarray, np.ndarray]:
+def fill_holes(depth: Depth) -> tuple[Depth, Depth]:
     """Fill the holes of depth maps from the nearest known pixel.
 
     A hole is a depth of NaN, 0 or less, or a masked value of a masked array. Infinity is a depth.
@@ -61,8 +55,11 @@ def fill_holes(depth: Tensor | np.ndarray) -> tuple[Tensor, Tensor] | tuple[np.n
         >>> fill_holes(np.array([[500, 0, 0, 2000]], np.uint16))[0]
         array([[ 500,  500, 2000, 2000]], dtype=uint16)
     """
-    if isinstance(depth, Tensor):
-        return _fill_tensor(depth)
+    filled: Any = _fill_tensor(depth) if isinstance(depth, Tensor) else _fill_array(depth)
+    return filled
+
+
+def _fill_array(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     check_part("depth", depth, np.ndarray, "a tensor or an array")
     if depth.dtype.kind not in "uif":
         raise TypeError(f"depth must hold numbers, got {depth.dtype}")

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.kernels.scattered_ops import SOURCE, Points, scattered_light, scattered_light_by_torch
+from kornia_tidy.kernels.scattered_ops import SOURCE, Points, Transform, scattered_light, scattered_light_by_torch
 from kornia_tidy.mode import Mode, torch_mode
 
 _SIGMA = 1.4  # period of the transform over the window: light beyond it folds back outside the used part
@@ -119,8 +119,8 @@ def scattered_energies(
         rows: sums over samples for the pixels along y, (F, V, P, N).
         columns: the same along x.
     """
-    tables = (part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines))
-    given = waves, weights, points, grid.width, *tables, rows.to(weights), columns.to(weights)
+    transform = Transform(grid.width, *(part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines)))
+    given = waves, weights, points, transform, rows.to(weights), columns.to(weights)
     here = waves.device.type == "cpu" and not torch_mode() & Mode.TRACED
     if here and compiled(SOURCE, weights.dtype) is not None:
         return scattered_light(*given)

@@ -213,6 +213,12 @@ class TestGatherOverField(SceneOperatorTester):
         with pytest.raises(ValueError, match=words):
             gather_overlap(**{**given, "places": given["places"]._replace(**changed)})
 
+    def test_exception_edges_of_another_dtype(self):
+        given = over_field()
+        places = given["places"]
+        with pytest.raises(TypeError, match=r"edges of tiles must be int64, got torch\.int32"):
+            gather_overlap(**{**given, "places": places._replace(row_edges=places.row_edges.int())})
+
     def test_exception_psfs_of_the_axis_with_places(self):
         with pytest.raises(ValueError, match=r"psfs over the field must have shape \(I, J, D, C, P, P\), got \(3, 2"):
             gather_overlap(**{**over_field(), "psfs": scene()["psfs"]})

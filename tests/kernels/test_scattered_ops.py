@@ -7,7 +7,7 @@ import random
 import pytest
 import torch
 
-from kornia_tidy.kernels.scattered_ops import SOURCE, Points, scattered_light, scattered_light_by_torch
+from kornia_tidy.kernels.scattered_ops import SOURCE, Points, Transform, scattered_light, scattered_light_by_torch
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
 
@@ -19,7 +19,7 @@ def a_case(seed: int = 2, dtype: torch.dtype = torch.float64) -> tuple:
 
 
 def called(function, case):
-    return function(*case[:2], Points(*case[2:6]), *case[6:])
+    return function(*case[:2], Points(*case[2:6]), Transform(*case[6:10]), *case[10:])
 
 
 class TestScatteredLight(OperatorTester):
