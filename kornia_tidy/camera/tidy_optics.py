@@ -433,6 +433,8 @@ class TiDyOptics(CameraState):
         given = self.compositing, self.memory_budget, defocus
         pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
         if pieces[0].window is not None:
+            if self.border == "valid":
+                check_border(self.border, height, width, pieces[0].window)
             held = held_nodes(cast("WideBlur", self.psf_model.wide_blur), defocus)
             groups = ", ".join(f"{len(nodes)} on grids of {group.grid} px" for group, nodes in held)
             words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"

@@ -173,4 +173,7 @@ def interpolated_bank(
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     matrix = fine_layer_matrix(nodes[0], spacing, len(nodes), targets, band)
     psfs = (bank.psfs.new_tensor(matrix) @ bank.psfs.flatten(1)).unflatten(1, bank.psfs.shape[1:])
-    return PSFBank(psfs, psfs.new_tensor(targets), psfs.sum((2, 3)))
+    light = psfs.sum((2, 3))
+    psfs = psfs.clamp(min=0)  # nearer to the truth, and occlusion divides by sums of parts
+    psfs = psfs * (light / psfs.sum((2, 3)).clamp(min=1e-30))[..., None, None]
+    return PSFBank(psfs, psfs.new_tensor(targets), light)

@@ -29,7 +29,7 @@ from kornia_tidy.psf.psf_cache import nodes_around, present_intervals
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
-from kornia_tidy.render.borders import cropped
+from kornia_tidy.render.borders import check_border, cropped
 from kornia_tidy.render.coarse_gather import gather_group
 from kornia_tidy.render.dispatch import Rendering, render_layers
 from kornia_tidy.render.over_field import render_over_field
@@ -162,7 +162,10 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
         given = light, defocus, replace(piece, keep=True), rendering
         return cast("Tensor", checkpoint(render_piece, *given, use_reentrant=False, preserve_rng_state=False))
     if piece.window is not None:
-        margin = piece.window // 2 if rendering.border == "valid" else 0
+        margin = 0  # other borders are continued as far as it takes
+        if rendering.border == "valid":
+            check_border("valid", *light.shape[-2:], piece.window)
+            margin = piece.window // 2
         return gather_group(light, defocus, piece.bank(), piece.holds(defocus), piece.grid, margin, rendering.border)
     bank = piece.bank()
     margin = bank.window // 2 if rendering.border == "valid" else 0

@@ -402,7 +402,8 @@ def questions(life: Life) -> None:
 
 def a_plan(life: Life) -> None:
     if life.how.fidelity.propagation != "paper":
-        life.optics.plan(life.scene.depth[..., :12, :12], life.scene.image[..., :12, :12], tolerance=1e-2)
+        side = max(12, life.optics.window) if life.how.border == "valid" else 12  # that border needs whole PSFs
+        life.optics.plan(life.scene.depth[..., :side, :side], life.scene.image[..., :side, :side], tolerance=1e-2)
 
 
 def a_burst(life: Life) -> None:

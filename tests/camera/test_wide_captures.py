@@ -142,6 +142,13 @@ class TestWideCaptures(BaseTester):
         with pytest.raises(ValueError, match=r"needs 181 layers of PSFs 699 px wide, some .* GiB"):
             optics(light(64), stairs(64))
 
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.parametrize("ask", ["__call__", "explain"])
+    def test_exception_an_image_smaller_than_the_psfs_that_must_lie_within(self, compositing, ask):
+        optics = fast_camera(border="valid", compositing=compositing)
+        with pytest.raises(ValueError, match=r"at least .* pixels a side for PSFs of .*, got 12x13"):
+            getattr(optics, ask)(torch.ones(1, 3, 12, 13), torch.full((1, 1, 12, 13), 1.6))
+
     @torch.no_grad()
     @pytest.mark.parametrize("aperture", sorted(APERTURES))
     def test_feature_other_apertures_are_as_exact_as_the_disc(self, aperture):

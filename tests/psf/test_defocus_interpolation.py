@@ -70,6 +70,23 @@ class TestInterpolationMatrix(BaseTester):
 
         self.gradcheck(energies, (torch.rand(12, 1, 3, 3),))
 
+    @torch.no_grad()
+    @pytest.mark.parametrize("layers", ["cubic", "bandlimited"])
+    def test_feature_interpolated_psfs_are_not_negative_so_occlusion_mixes_what_is_there(self, layers):
+        """Occlusion divides by the part of a PSF that sees a layer, which may be near zero where PSFs are negative."""
+        generator = torch.Generator().manual_seed(0)
+        image = 0.25 + 0.5 * torch.rand(1, 3, 22, 48, generator=generator)
+        depth = 1 / (3.3 * torch.rand(1, 1, 22, 48, generator=generator) + 1e-3)
+        fidelity = Fidelity(window=15, layers=layers, layer_spacing=5.0 if layers == "cubic" else 0.9)
+        optics = TiDyOptics(
+            PixelwiseMask(2, generator=generator), fidelity=fidelity, compositing="occlusion", sensor=None
+        )
+        optics.color_space = "linear"
+        assert optics.psf_bank().psfs.min() >= 0
+        coded = optics(image, depth)
+        assert coded.min() > 0.25 - 1e-5
+        assert coded.max() < 0.75 + 1e-5
+
 
 class TestFineLayerMatrix(BaseTester):
     @pytest.mark.parametrize("spacing", [1.0, 0.9, 0.5])
