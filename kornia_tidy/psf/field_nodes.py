@@ -129,7 +129,10 @@ def _phases(
     rows = []
     first, second = torch.triu_indices(len(at), len(at), 1)
     for turned in turned_lenses(lens, [(y * pitch, x * pitch) for y, x in field], defocus, wavelength):
-        polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, y[None], x[None])
+        down, right = y - turned.shift[0], x - turned.shift[1]  # where the light is that passes the same mask pixels
+        beyond = torch.hypot(down, right).clamp(min=1)  # which the stop cuts
+        places = (down / beyond)[None], (right / beyond)[None]
+        polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, *places)
         phase = turned.phase(polynomials)[:, 0]
         along, across = (part[0] * 2 * math.pi * pitch * reach / wavelength for part in turned.frequencies(polynomials))
         seen = torch.cat([phase, phase + along, phase + across])  # (depths and pixels, points)

@@ -171,12 +171,13 @@ def turned_lenses(
     parts = {name: getattr(series, name) for name in _PARTS}
     degree = max(2, *(degree_of(part.shape[-1], sines=name in _SINES) for name, part in parts.items()))
     turned = {name: _turned(part, azimuths, degree, sines=name in _SINES) for name, part in parts.items()}
+    shifts = [(y * lens.table.mask_shift, x * lens.table.mask_shift) for y, x in field]
     terms = {
         name: defocus_terms(psi, lens.table.reach, part.shape[1]) for name, part in parts.items() if part.ndim == 3
     }
     return [
-        TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, edges, azimuth, psi, wavelength)
-        for i, (edges, azimuth) in enumerate(zip(series.edges, azimuths.tolist(), strict=True))
+        TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, edges, *rest, psi, wavelength)
+        for i, (edges, *rest) in enumerate(zip(series.edges, azimuths.tolist(), shifts, strict=True))
     ]
 
 
@@ -217,10 +218,10 @@ class Stop:
 
 
 def _alike(turned: Sequence[TurnedLens]) -> list[list[int]]:
-    """Return the field points from which the open stop looks the same."""
+    """Return the field points from which the open stop and the masks on it look the same."""
     found: dict[tuple[float, ...], list[int]] = {}
     for i, own in enumerate(turned):
-        found.setdefault(tuple(own.discs().flatten().tolist()), []).append(i)
+        found.setdefault((*own.discs().flatten().tolist(), *own.shift), []).append(i)
     return list(found.values())
 
 
@@ -234,19 +235,24 @@ def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> S
     parts = max(1, math.ceil(half / _LONGEST))
     order = max(4, gauss_legendre_order(half / parts, tolerance))
     discs = tuple(map(tuple, turned.discs().tolist()))
-    return _stop_points(tuple(map(tuple, spans.tolist())), parts, order, discs, turned.degree)
+    return _stop_points(tuple(map(tuple, spans.tolist())), parts, order, discs, turned.degree, turned.shift)
 
 
 @lru_cache(maxsize=8)
 def _stop_points(
-    spans: tuple[tuple[float, ...], ...], parts: int, order: int, discs: tuple[tuple[float, ...], ...], degree: int
+    spans: tuple[tuple[float, ...], ...],
+    parts: int,
+    order: int,
+    discs: tuple[tuple[float, ...], ...],
+    degree: int,
+    shift: tuple[float, float],
 ) -> Stop:
     with torch.inference_mode(False):
         begin, end = np.array(spans)
         steps = np.arange(parts + 1) / parts
         edges = begin[:, None] + (end - begin)[:, None] * steps
         fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
-        points = stop_quadrature(fine, order, np.array(discs))
+        points = stop_quadrature(fine, order, np.array(discs), shift)
         points = StopQuadrature(points.row // parts, points.column // parts, points.x, points.y, points.weight)
         count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
         polynomials = zernike_polynomials(max(count, smooth), points.y, points.x)
@@ -350,6 +356,7 @@ class TurnedLens:
         degree: of the polynomials.
         edges: of rims, centre along the field and radius in stop radii, (E, 2).
         azimuth: of the field point, from +x towards +y.
+        shift: y and x by which light passes masks off the stop beside where it passes the stop, in stop radii.
         psi: defocus in radians at 530 nm, (D,).
         wavelength: in metres.
     """
@@ -359,6 +366,7 @@ class TurnedLens:
     degree: int
     edges: Tensor
     azimuth: float
+    shift: tuple[float, float]
     psi: Tensor
     wavelength: float
 

@@ -32,6 +32,12 @@ def camera(compositing: str = "gather", border: str = "reflect", center=CORNER, 
     return TiDyOptics(masks, field_center=center, **settings, **parts)
 
 
+def off_stop(mask_shift: float) -> dict:
+    """The parts of a camera with its masks off the stop."""
+    lens = Lens.named("single-50mm", 17.6, 0.595).with_masks_off_stop(mask_shift)
+    return {"lens": lens, "camera": lens.camera(8e-6)}
+
+
 def scene(height: int = 72, width: int = 100, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Noise of light, and steps of depth from near to far."""
     generator = torch.Generator().manual_seed(seed)
@@ -66,12 +72,13 @@ PIXELS = [(0, 0), (35, 50), (63, 64), (71, 99), (20, 81)]
 
 class TestLensCaptures(BaseTester):
     @pytest.mark.parametrize(
-        ("compositing", "border"), [*(("gather", border) for border in BORDERS), ("occlusion", "zero")]
+        ("compositing", "border", "mask_shift"),
+        [*(("gather", border, 0.0) for border in BORDERS), ("occlusion", "zero", 0.0), ("gather", "zero", 22.0)],
     )
     @torch.no_grad()
-    def test_feature_a_pixel_sees_through_the_psf_of_its_place(self, compositing, border):
+    def test_feature_a_pixel_sees_through_the_psf_of_its_place(self, compositing, border, mask_shift):
         """The whole picture is rendered through one pixel's PSFs, which must give that pixel."""
-        optics, (image, depth) = camera(compositing, border), scene()
+        optics, (image, depth) = camera(compositing, border, **off_stop(mask_shift)), scene()
         seen, margin = optics(image, depth), 8 if border == "valid" else 0
         lost = []
         for pixel in PIXELS:
@@ -259,12 +266,14 @@ class TestLensCaptures(BaseTester):
         same = render(image, optics.defocus(depth), PSFBank(axis.psfs[0], axis.defocus, axis.energy[0]))
         self.assert_close(optics(image, depth), same, rtol=0, atol=1e-3)
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_gradcheck_along_a_direction(self, compositing):
+    @pytest.mark.parametrize(
+        ("compositing", "mask_shift"), [("gather", 0.0), ("scatter", 0.0), ("occlusion", 0.0), ("gather", 22.0)]
+    )
+    def test_gradcheck_along_a_direction(self, compositing, mask_shift):
         """To masks, light and depth, against differences of captures; behind what hides the last two are of cells."""
         settings = SETTINGS.replace(double=True, window=9, layer_spacing=20.0)
         settings = settings.replace(field_tolerance=1e-4) if compositing == "occlusion" else settings
-        optics = camera(compositing, "zero", fidelity=settings)
+        optics = camera(compositing, "zero", fidelity=settings, **off_stop(mask_shift))
         (image, depth), generator = scene(20, 24), torch.Generator().manual_seed(5)
         start = image.double(), depth.double(), optics.masks.phase.detach().double()
         ways = [torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in start]
@@ -310,10 +319,11 @@ class TestLensCaptures(BaseTester):
         assert torch.equal(captures[0], captures[-1])
         assert len(pickle.dumps(optics)) < len(pickle.dumps(camera())) + 20_000
 
+    @pytest.mark.parametrize("mask_shift", [0.0, -22.0])
     @torch.no_grad()
-    def test_feature_states_restore_captures_to_the_last_bit(self):
-        optics, (image, depth) = camera(), scene(24, 24)
-        other = camera()
+    def test_feature_states_restore_captures_to_the_last_bit(self, mask_shift):
+        optics, (image, depth) = camera(**off_stop(mask_shift)), scene(24, 24)
+        other = camera(**off_stop(0.0))
         other.masks.phase.data.zero_()
         other.load_state_dict(optics.state_dict())
         assert torch.equal(other(image, depth), optics(image, depth))

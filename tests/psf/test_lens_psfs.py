@@ -41,7 +41,8 @@ def huygens(lens: Lens, phase: torch.Tensor, field: tuple[float, float], psi: fl
     """PSF at the centres of pixels by a sum over a fine even grid of the stop, cell by cell of the mask: (P, P)."""
     cells, fine = 23, 9
     line = ((torch.arange(cells * fine) + 0.5) / (cells * fine) - 0.5).double() * 2.3
-    y, x = (part.flatten() for part in torch.meshgrid(line, line, indexing="ij"))
+    at_mask = (line - lens.mask_shift * f * pitch for f in field)
+    y, x = (part.flatten() for part in torch.meshgrid(*at_mask, indexing="ij"))
     azimuth, height = math.atan2(*field), math.hypot(*field) * pitch
     along, across = x * math.cos(azimuth) + y * math.sin(azimuth), y * math.cos(azimuth) - x * math.sin(azimuth)
     sample = lens.sample(torch.tensor([height]), torch.tensor([psi]), 530e-9)
@@ -75,6 +76,32 @@ class TestLensPSFs(BaseTester):
         psf = found.psfs[0, 0, 0].detach() / found.light[0, 0, 0]
         # The even grid cuts the stop's edge in steps of its pitch: 1 % of the light in the middle of the PSF.
         assert float((psf - expected).norm() / expected.norm()) < 0.02
+
+    @pytest.mark.parametrize(
+        ("shift", "field"), [(20.0, (0.0, 9600.0)), (-30.0, (-4800.0, 8000.0)), (150.0, (0, 9600))]
+    )
+    @torch.no_grad()
+    def test_feature_masks_off_the_stop(self, shift, field):
+        """The mask pixel that each ray meets, and the opaque frame beside the mask, as Huygens waves see them."""
+        lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=6e-3)
+        lens, masks, pitch = lens.with_masks_off_stop(shift), random_mask(), 0.5e-6
+        found = model(lens, masks, pitch).psf_bank(defocus=[7.0], field=[field, (0.0, 0.0)])
+        expected = huygens(lens, masks.phase[0], field, 7.0, pitch, 21)
+        psf = found.psfs[0, 0, 0] / found.light[0, 0, 0]
+        assert float((psf - expected).norm() / expected.norm()) < 0.02
+        there = model(lens.with_masks_off_stop(0.0), masks, pitch).psf_bank(defocus=[7.0], field=[field, (0.0, 0.0)])
+        assert torch.equal(found.psfs[1], there.psfs[1])
+        assert float((found.psfs[0] - there.psfs[0]).norm() / there.psfs[0].norm()) > 0.1
+        covered = float(found.light[0, 0, 0] / there.light[0, 0, 0])
+        assert covered == pytest.approx(1, abs=5e-4) if abs(shift) * 4.8e-3 < 0.15 else covered < 0.95
+
+    def test_exception_masks_off_the_stop(self):
+        lens = Lens.from_seidel(50e-3, 16.0, 0.595, 7e-3)
+        for shift in (150.0, -150.0, math.nan):
+            with pytest.raises(ValueError, match="move masks by at most one stop radius over the lens"):
+                lens.with_masks_off_stop(shift)
+        with pytest.raises(TypeError, match="mask_shift must be a number, got 'far'"):
+            lens.with_masks_off_stop("far")
 
     def test_feature_an_ideal_lens_is_the_thin_lens(self):
         """On the axis, with the smooth disc of a fine aperture; its edge cells hold their mean field."""

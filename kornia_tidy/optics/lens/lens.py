@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import torch
@@ -14,7 +15,7 @@ from kornia_tidy.checks import check_number, described
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.ideal_table import read_zernike_table, seidel_wavefront
-from kornia_tidy.optics.lens.lens_file import lens_bytes, lens_parts
+from kornia_tidy.optics.lens.lens_file import check_mask_shift, lens_bytes, lens_parts
 from kornia_tidy.optics.lens.lens_table import LensSample, LensTable
 from kornia_tidy.optics.lens.made_lenses import (
     RGB,
@@ -50,7 +51,8 @@ class Lens(nn.Module):
         residual: largest rms over the stop of the table's error against the traced wavefronts, in waves.
 
     Convention:
-        - The stop lies in the mask's plane; positions in it are in stop radii. Depth counts from the entrance pupil.
+        - The masks lie in the stop unless :meth:`with_masks_off_stop` moves them; positions in it are in stop radii.
+          Depth counts from the entrance pupil.
         - Wavefronts are those of rays that join points of the stop with the object and with the image point, which is
           where the ray through the stop's centre meets the sensor, at each wavelength. Distortion and lateral colour
           are where it lies.
@@ -252,6 +254,35 @@ class Lens(nn.Module):
         given = focal_length, f_number, focus_distance, field
         return cls(*ideal_parts("Zernike table", os.path.basename(path), wavefront, waves, *given))
 
+    def with_masks_off_stop(self, mask_shift: float) -> Self:
+        r"""Return this lens with the masks off its stop, where light of each field point passes another part of them.
+
+        .. math:: U(\rho; h) = A \, e^{i \phi(\rho + \sigma h)}
+
+        Args:
+            mask_shift: :math:`\sigma` in stop radii per metre of height on the sensor. A mask in air at the distance d
+                behind a stop of radius R, where the chief ray to the height h has the slope s, has
+                :math:`\sigma = d s / (R h)`; in front of the stop it is negative. 0: in the stop.
+
+        Raises:
+            TypeError: if it is not a number.
+            ValueError: if masks would move by more than a stop radius within the lens's field.
+
+        Convention:
+            - To first order: that light of one point converges between stop and masks, and that masks and the stop's
+              edge diffract in two planes, is left out.
+            - Masks and aperture move together. Beyond their 2.3 stop radii is the opaque frame, which vignettes.
+
+        Source: Wei et al., Learned Off-aperture Encoding (2025), arXiv:2507.22523.
+
+        Example:
+            >>> lens = Lens.named("single-50mm", 17.6, 0.595).with_masks_off_stop(20.0)
+            >>> lens.mask_shift
+            20.0
+        """
+        check_mask_shift(mask_shift, self.field)
+        return type(self)(*self._parts()._replace(table=replace(self._table, mask_shift=float(mask_shift))))
+
     # ------------------------------------------------------------------ its effect on light
 
     @property
@@ -263,6 +294,11 @@ class Lens(nn.Module):
     def table(self) -> LensTable:
         """Coefficients of the lens."""
         return self._table
+
+    @property
+    def mask_shift(self) -> float:
+        """Stop radii per metre of masks off the stop, see :meth:`with_masks_off_stop`."""
+        return self._table.mask_shift
 
     @property
     def residual(self) -> float:
@@ -445,10 +481,11 @@ class Lens(nn.Module):
     def extra_repr(self) -> str:
         """Return a one-line description."""
         low, high = self.defocus_range
+        moved = f", masks off the stop by {self.mask_shift:+.3g} radii/m" if self.mask_shift else ""
         return (
             f"{self.name}: {self.focal_length * 1e3:.4g} mm f/{self.f_number:.3g}, focus at {self.focus_distance:.4g} "
             f"m, field to {self.field * 1e3:.3g} mm, psi {low:+.1f} to {high:+.1f}, "
-            f"{', '.join(f'{w * 1e9:.0f}' for w in self.wavelengths)} nm, {self.residual:.4f} waves rms off"
+            f"{', '.join(f'{w * 1e9:.0f}' for w in self.wavelengths)} nm, {self.residual:.4f} waves rms off{moved}"
         )
 
 

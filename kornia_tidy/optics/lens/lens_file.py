@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_finite, check_positive
+from kornia_tidy.checks import check_finite, check_number, check_positive, described
 from kornia_tidy.files import parse_json
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens_table import EXACT, LensTable
@@ -26,7 +26,9 @@ def lens_bytes(parts: LensParts) -> bytes:
     tensors |= {name: getattr(parts.table, name) for name in EXACT}
     tensors["scalars"] = torch.tensor([getattr(parts, name) for name in _SCALARS], dtype=torch.float64)
     # One entry: safetensors writes several in any order, and equal lenses are equal files.
-    return save(tensors, {_FORMAT: json.dumps({"name": parts.name, "source": parts.source})})
+    words = {"name": parts.name, "source": parts.source}
+    moved = {"mask_shift": shift} if (shift := parts.table.mask_shift) else {}  # files of masks in the stop lack it
+    return save(tensors, {_FORMAT: json.dumps({**words, **moved})})
 
 
 def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: str) -> LensParts:
@@ -40,7 +42,7 @@ def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: st
     Raises:
         ValueError: if the file is not a lens, a value is NaN or infinite, or shapes do not fit.
     """
-    names = {*LensTable.__dataclass_fields__, "scalars"}
+    names = {*LensTable.__dataclass_fields__, "scalars"} - {"mask_shift"}
     if _FORMAT not in notes or set(tensors) != names:
         raise ValueError(f"{path} is not a lens: it is {sorted(notes)!r:.60} with {sorted(tensors)!r:.200}")
     for name, value in tensors.items():
@@ -59,7 +61,32 @@ def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: st
         words = parse_json(notes[_FORMAT])
         if not isinstance(words, dict) or {type(words.get(name)) for name in ("name", "source")} != {str}:
             raise ValueError("it must have a name and a source")
-        table = LensTable(**{name: value.double() for name, value in tensors.items() if name != "scalars"})
+        parts = {name: value.double() for name, value in tensors.items() if name != "scalars"}
+        if tuple(parts["field"].shape) != (2,):
+            raise ValueError(f"field must have shape (2,), got {tuple(parts['field'].shape)}")
+        if type(shift := words.get("mask_shift", 0.0)) not in (int, float):
+            raise ValueError(f"mask_shift must be a number, got {described(shift)}")
+        check_mask_shift(shift, float(parts["field"][0]))
+        table = LensTable(**parts, mask_shift=float(shift))
     except ValueError as error:
         raise ValueError(f"cannot read {path}: {error}") from None
     return LensParts(words["name"], words["source"], table=table, **given)
+
+
+def check_mask_shift(shift: float, field: float) -> None:
+    """Raise an error unless masks off the stop stay on the light of a field.
+
+    Args:
+        shift: in stop radii per metre.
+        field: largest height in metres.
+
+    Raises:
+        TypeError: if it is not a number.
+        ValueError: if masks would move by more than a stop radius.
+    """
+    check_number("mask_shift", shift)
+    if not abs(shift) * field <= 1:  # False for NaN too
+        raise ValueError(
+            f"mask_shift must move masks by at most one stop radius over the lens's field of {field:.4g} m, got "
+            f"{shift:.4g} stop radii per metre: move the masks nearer to the stop, or make the lens for a smaller field"
+        )

@@ -38,7 +38,7 @@ class LensTable:
         tangent: slope from the entrance pupil to the object over height on the sensor, 1/m, (S, H).
         edges: discs that a surface's rim leaves of the stop: centre along the field and radius in stop radii,
             (H, E, 2); the stop's own edge is not among them.
-
+        mask_shift: of masks off the stop, see :meth:`~kornia_tidy.optics.lens.lens.Lens.with_masks_off_stop`.
     """
 
     wavelengths: Tensor
@@ -52,15 +52,16 @@ class LensTable:
     chief: Tensor
     tangent: Tensor
     edges: Tensor
+    mask_shift: float = 0.0
 
     def tensors(self) -> dict[str, Tensor]:
         """Return all parts by their names."""
-        return {part.name: getattr(self, part.name) for part in fields(self)}
+        return {part.name: getattr(self, part.name) for part in fields(self) if part.name != "mask_shift"}
 
     def rounded(self) -> LensTable:
         """Return the table as files hold it: in float32, but for :data:`EXACT`."""
         parts = self.tensors().items()
-        return LensTable(**{name: part if name in EXACT else part.float().to(part.dtype) for name, part in parts})
+        return replace(self, **{name: part if name in EXACT else part.float().to(part.dtype) for name, part in parts})
 
     @property
     def reach(self) -> tuple[float, float]:

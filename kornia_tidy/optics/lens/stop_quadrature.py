@@ -35,13 +35,14 @@ class StopQuadrature:
     weight: Tensor
 
 
-def stop_quadrature(spans: Array, order: int, discs: Array) -> StopQuadrature:
+def stop_quadrature(spans: Array, order: int, discs: Array, shift: tuple[float, float] = (0.0, 0.0)) -> StopQuadrature:
     """Return the quadrature of cells cut by discs.
 
     Args:
         spans: begin and end of the cells along either axis, (2, n) in stop radii.
         order: Gauss-Legendre points along a side of a patch.
         discs: centres x, y and radius of the discs that light must pass, (E, 3) in stop radii.
+        shift: y and x by which the cells lie before their spans, in stop radii.
 
     Example:
         >>> edges = np.linspace(-1.15, 1.15, 24)
@@ -52,6 +53,7 @@ def stop_quadrature(spans: Array, order: int, discs: Array) -> StopQuadrature:
     begin, end = spans
     rows, columns = (part.ravel() for part in np.meshgrid(np.arange(len(begin)), np.arange(len(begin)), indexing="ij"))
     box = np.stack([begin[columns], end[columns], begin[rows], end[rows]])  # x from, x to, y from, y to
+    box -= np.repeat(shift[::-1], 2)[:, None]
     keep = (box[1] - box[0] > _TOUCH) & (box[3] - box[2] > _TOUCH)
     whole = keep.copy()
     for x, y, radius in discs:
