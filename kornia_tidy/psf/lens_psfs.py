@@ -175,9 +175,10 @@ def turned_lenses(
     terms = {
         name: defocus_terms(psi, lens.table.reach, part.shape[1]) for name, part in parts.items() if part.ndim == 3
     }
+    places = zip(series.edges, azimuths.tolist(), shifts, strict=True)
     return [
-        TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, edges, *rest, psi, wavelength)
-        for i, (edges, *rest) in enumerate(zip(series.edges, azimuths.tolist(), shifts, strict=True))
+        TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, *place, psi, wavelength)
+        for i, place in enumerate(places)
     ]
 
 
