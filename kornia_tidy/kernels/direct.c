@@ -6,6 +6,10 @@
 // registers: one vector of light is loaded once and multiplied by a different PSF sample for each row of the strip. The
 // last blocks of a row and of a plane are shifted back inside and overlap with their neighbours.
 //
+// A PSF is a list of terms, its samples that are not zero. Columns of a disc are runs of one value: of sums of the light
+// down its columns it takes the two ends of each run, so that a disc has as many terms as pixels on its edge, not in its
+// area (summed-area tables in one dimension; Crow 1984).
+//
 // Layers are given as in scene.py: a pixel belongs to layer `index` or, with the weight `weight`, to the next one. PSFs
 // are flipped by 180 degrees, so output pixel (y, x) reads plane pixels (y, x) to (y + side - 1, x + side - 1).
 //
@@ -17,10 +21,10 @@
 #include "field.h"
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
-enum { ROW_CHUNK = 4 };  // rows of light that are summed separately
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
 enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
-
+enum { TILE_ROWS = 16, TILE_COLUMNS = 256 };  // of pixels that share sums of columns, which stay in the cache
+enum { RUN = 5 };  // terms in adjacent rows that are added together
 
 // The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {
@@ -40,77 +44,116 @@ typedef struct {
     int32_t layer, strips;
 } member;
 
-// Adds the products of two rows of light to the sums of strips. Row `upper` serves the strip's rows up to `split`, row
-// `lower`, a PSF's height below it, the others, so that no product is wasted. `step` columns have separate sums, so that
-// their additions do not depend on each other.
-INLINE void add_rows(const REAL *upper, const REAL *lower, const REAL *psf, int64_t side, int split, int strips, int step,
-                     vec sums[2][2][ROWS]) {
-    int64_t j = 0;
-    for (; j < side; j += step)
-#pragma GCC unroll 2
-        for (int s = 0; s < step; s++) {
-            if (s && j + s == side) break;
-#pragma GCC unroll 2
-            for (int strip = 0; strip < strips; strip++) {
-                vec x = *(const loose *)(upper + j + s + strip * LANES), z = x;
-                if (split < ROWS - 1) z = *(const loose *)(lower + j + s + strip * LANES);
-#pragma GCC unroll 4
-                for (int v = 0; v < ROWS; v++)
-                    sums[s][strip][v] += psf[(j + s) * side - v + (v > split ? side : 0)] * (v > split ? z : x);
+// The PSFs as terms. Of PSF p (layer by layer, channel by channel) those with n + 1 terms in adjacent rows are runs
+// first[p * RUN + n] to first[p * RUN + n + 1] - 1.
+typedef struct {
+    int64_t *first;    // (psfs * RUN + 1,)
+    uint8_t *summed;   // (psfs,): 1 for terms of sums down columns, 0 for terms of the light
+    int64_t *offsets;  // (runs,): of the first term, from the first sample that a pixel reads
+    REAL *weights;     // (runs, RUN)
+    int sums;          // whether any PSF takes sums
+} terms;
+
+static void free_terms(terms *t) { free(t->first), free(t->summed), free(t->offsets), free(t->weights); }
+
+// Lists the terms of all PSFs; `pitch` is that of the sums. Returns whether there is memory for them.
+static int list_terms(const scene *s, int64_t pitch, terms *t) {
+    const int64_t psfs = s->layers * s->channels, side = s->side, most = side * (side / 2 + 1);  // runs of one PSF
+    t->first = calloc(psfs * RUN + 1, sizeof(int64_t));
+    t->summed = calloc(psfs, 1);
+    t->offsets = malloc(psfs * most * sizeof(int64_t));
+    t->weights = malloc(psfs * most * RUN * sizeof(REAL));
+    REAL *column = malloc((side + 1) * sizeof(REAL));
+    int taken = t->first && t->summed && t->offsets && t->weights && column;
+    int64_t end = 0;
+    for (int64_t p = 0; taken && p < psfs; p++) {
+        const REAL *psf = s->psfs + p * side * side;
+        int64_t samples = 0, ends = 0, *first = t->first + p * RUN;
+        for (int64_t j = 0; j < side; j++, psf += side) {
+            for (int64_t r = 0; r < side; r++) samples += psf[r] != 0, ends += psf[r] != (r ? psf[r - 1] : 0);
+            ends += psf[side - 1] != 0;
+        }
+        const int summed = t->summed[p] = ends < samples;
+        t->sums |= summed;
+        for (int length = 1; length <= RUN; length++) {
+            psf = s->psfs + p * side * side;
+            for (int64_t j = 0; j < side; j++, psf += side) {
+                for (int64_t r = 0; r <= side; r++)
+                    column[r] = summed ? (r ? psf[r - 1] : 0) - (r < side ? psf[r] : 0) : r < side ? psf[r] : 0;
+                for (int64_t r = 0, next; r <= side; r = next) {
+                    for (next = r; next <= side && next < r + RUN && column[next] != 0;) next++;
+                    if (next - r == length) {
+                        t->offsets[end] = r * (summed ? pitch : s->plane_row) + j;
+                        memcpy(t->weights + end++ * RUN, column + r, length * sizeof(REAL));
+                    }
+                    next += next == r;
+                }
             }
+            first[length] = end;
         }
-}
-
-// Convolves the light of strips with one PSF. Every ROW_CHUNK rows of light have separate sums, which are added at the
-// end: blocked summation has a smaller rounding error than one long sum.
-INLINE void convolve(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, int strips, vec total[2][ROWS]) {
-    const int step = strips == 1 ? 2 : 1;
-    const REAL *lower = light + side * pitch;
-    for (int strip = 0; strip < strips; strip++)
-        for (int v = 0; v < ROWS; v++) {
-            vec only = *(const loose *)(light + v * pitch + strip * LANES);
-            total[strip][v] = side == 1 ? *psf * only : (vec){0};
-        }
-    if (side == 1) return;  // lower than a strip, handled above
-    for (int64_t first = 0; first < side; first += ROW_CHUNK) {
-        vec sums[2][2][ROWS];
-        memset(sums, 0, sizeof sums);
-        for (int64_t r = first; r < least(first + ROW_CHUNK, side); r++) {
-            const REAL *x = light + r * pitch, *z = lower + r * pitch, *p = psf + r;
-            if (r >= ROWS - 1) add_rows(x, x, p, side, ROWS - 1, strips, step, sums);
-            else if (r == 0) add_rows(x, z, p, side, 0, strips, step, sums);
-            else if (r == 1) add_rows(x, z, p, side, 1, strips, step, sums);
-            else add_rows(x, z, p, side, 2, strips, step, sums);
-        }
-        for (int strip = 0; strip < strips; strip++)
-            for (int v = 0; v < ROWS; v++)
-                total[strip][v] += step == 2 ? sums[0][strip][v] + sums[1][strip][v] : sums[0][strip][v];
     }
+    free(column);
+    return taken;
 }
 
-static void convolve_strip(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, vec total[2][ROWS]) {
-    convolve(light, pitch, psf, side, 1, total);
+// Adds terms of a PSF, `count` in adjacent rows, to strips: a row of light is loaded once for all rows of a strip.
+INLINE void add_terms(const REAL *light, int64_t pitch, const REAL *weights, int count, int strips, vec sums[2][ROWS]) {
+#pragma GCC unroll 2
+    for (int strip = 0; strip < strips; strip++)
+#pragma GCC unroll 8
+        for (int r = 0; r < ROWS + count - 1; r++) {
+            const vec x = *(const loose *)(light + r * pitch + strip * LANES);
+#pragma GCC unroll 4
+            for (int v = 0; v < ROWS; v++)
+                if (r - v >= 0 && r - v < count) sums[strip][v] += weights[r - v] * x;
+        }
 }
 
-static void convolve_block(const REAL *light, int64_t pitch, const REAL *psf, int64_t side, vec total[2][ROWS]) {
-    convolve(light, pitch, psf, side, 2, total);
+// Convolves strips with one PSF.
+INLINE void convolve(const terms *t, int64_t psf, const REAL *light, int64_t pitch, int strips, vec total[2][ROWS]) {
+    const int64_t *first = t->first + psf * RUN;
+    int64_t n = first[0];
+    vec sums[2][ROWS];
+    memset(sums, 0, sizeof sums);
+#pragma GCC unroll 5
+    for (int count = 1; count <= RUN; count++)
+        for (; n < first[count]; n++) add_terms(light + t->offsets[n], pitch, t->weights + n * RUN, count, strips, sums);
+    memcpy(total, sums, strips * sizeof *sums);
 }
 
-INLINE int note(member *members, int count, int64_t layer, int strip) {
-    int n = 0;
-    while (n < count && members[n].layer != layer) n++;
-    if (n == count) members[count++] = (member){layer, 0};
-    members[n].strips |= 1 << strip;
-    return count;
+static void convolve_strip(const terms *t, int64_t psf, const REAL *light, int64_t pitch, vec total[2][ROWS]) {
+    convolve(t, psf, light, pitch, 1, total);
 }
 
-// Lists the layers of a block's pixels and returns their number; 0 if a layer index is invalid, as for a NaN depth.
-INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight, member *members) {
-    uint64_t other = 0, last = 0, layers = s->layers;
+static void convolve_block(const terms *t, int64_t psf, const REAL *light, int64_t pitch, vec total[2][ROWS]) {
+    convolve(t, psf, light, pitch, 2, total);
+}
+
+// The labels of a block's pixels in vectors, and the weights of the next layer: zeros where there are none.
+typedef struct {
+    bits layer[2][ROWS];
+    vec next[2][ROWS];
+} labels;
+
+INLINE void read_labels(const scene *s, const int64_t *index, const REAL *weight, labels *l) {
+    for (int strip = 0; strip < 2; strip++)
+        for (int v = 0; v < ROWS; v++) {
+            const int64_t at = strip * LANES;
+            for (int i = 0; i < LANES; i++) l->layer[strip][v][i] = index[v * s->index_row + at + i];
+            l->next[strip][v] = (vec){0};
+            if (weight) l->next[strip][v] = *(const loose *)(weight + v * s->weight_row + at);
+        }
+}
+
+// Lists the layers of a block's pixels and returns their number; 0 if a layer index is invalid, as for a NaN depth. `seen`
+// has 2 * (layers + 1) zeros, and keeps them.
+INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight, uint8_t *seen, member *members) {
+    uint64_t other = 0, first = index[0], last = first, layers = s->layers;
     for (int v = 0; v < ROWS; v++)
         for (int i = 0; i < WIDTH; i++) {
             uint64_t layer = index[v * s->index_row + i];
             other |= layer ^ (uint64_t)index[0];
+            first = layer < first ? layer : first;
             last = layer > last ? layer : last;
         }
     if (last >= layers) return 0;
@@ -118,83 +161,121 @@ INLINE int list_members(const scene *s, const int64_t *index, const REAL *weight
         members[0] = (member){index[0], 3};
         return 1;
     }
+    for (int strip = 0; strip < 2; strip++)
+        for (int v = 0; v < ROWS; v++)
+            for (int i = strip * LANES; i < (strip + 1) * LANES; i++) {
+                const int64_t layer = index[v * s->index_row + i];
+                const REAL f = weight ? weight[v * s->weight_row + i] : 0;
+                seen[2 * (layer + (!s->weight_gradient && f == 1)) + strip] = 1;
+                seen[2 * (layer + (s->weight_gradient || f > 0)) + strip] = 1;
+            }
     int count = 0;
-    for (int v = 0; v < ROWS; v++)
-        for (int i = 0; i < WIDTH; i++) {
-            int64_t layer = index[v * s->index_row + i];
-            REAL f = weight ? weight[v * s->weight_row + i] : 0;
-            if (s->weight_gradient || f != 1) count = note(members, count, layer, i / LANES);
-            if ((s->weight_gradient || f > 0) && layer + 1 < s->layers) count = note(members, count, layer + 1, i / LANES);
-        }
+    for (uint64_t layer = first; layer <= last + 1; layer++) {
+        const int strips = seen[2 * layer] + 2 * seen[2 * layer + 1];
+        seen[2 * layer] = seen[2 * layer + 1] = 0;
+        if (strips && layer < layers) members[count++] = (member){layer, strips};
+    }
     return count;
 }
 
 // Computes the weights of a layer for the pixels of a strip; for gradients, -1 for `index` and 1 for the next layer.
-INLINE void weigh(const scene *s, const int64_t *index, const REAL *weight, int64_t layer, vec weights[ROWS]) {
+INLINE void weigh(const scene *s, const labels *l, int strip, int64_t layer, vec weights[ROWS]) {
     for (int v = 0; v < ROWS; v++) {
-        const int64_t *l = index + v * s->index_row;
-        const REAL *f = weight ? weight + v * s->weight_row : 0;
-        REAL *w = (REAL *)&weights[v];
-        if (s->weight_gradient)
-            for (int i = 0; i < LANES; i++) w[i] = (REAL)(l[i] + 1 == layer) - (REAL)(l[i] == layer);
-        else if (f)
-            for (int i = 0; i < LANES; i++) w[i] = l[i] == layer ? 1 - f[i] : l[i] + 1 == layer ? f[i] : 0;
-        else
-            for (int i = 0; i < LANES; i++) w[i] = l[i] == layer;
+        const bits own = l->layer[strip][v] == (lane)layer, below = l->layer[strip][v] == (lane)(layer - 1);
+        const vec f = l->next[strip][v];
+        if (s->weight_gradient) weights[v] = where(below, all(1)) - where(own, all(1));
+        else weights[v] = choose(own, 1 - f, where(below, f));
     }
 }
 
-static void mix_block(const scene *s, const REAL *light, const int64_t *index, const REAL *weight, const member *members,
-                      int count, const REAL *psfs, REAL *out, int skip) {
-    vec total[2][ROWS], own[2][ROWS], weights[ROWS];
-    int64_t stride = s->channels * s->side * s->side;
-    if (count == 1 && !weight)
-        convolve_block(light, s->plane_row, psfs + members->layer * stride, s->side, total);
-    else {
-        memset(total, 0, sizeof total);
-        for (int n = 0; n < count; n++) {
-            const REAL *psf = psfs + members[n].layer * stride;
-            int first = members[n].strips == 2, last = members[n].strips != 1;
-            if (members[n].strips == 3) convolve_block(light, s->plane_row, psf, s->side, own);
-            else convolve_strip(light + first * LANES, s->plane_row, psf, s->side, own + first);
-            for (int strip = first; strip <= last; strip++) {
-                int at = strip * LANES;
-                weigh(s, index + at, weight ? weight + at : 0, members[n].layer, weights);
-                for (int v = 0; v < ROWS; v++) total[strip][v] += weights[v] * own[strip][v];
-            }
+// Sums light down the columns of a tile: row r has the sum of the r rows above it. They begin anew in each tile, so that
+// their rounding error does not grow with the image.
+INLINE void sum_columns(const REAL *light, int64_t light_pitch, int64_t rows, int64_t columns, REAL *sums, int64_t pitch) {
+    memset(sums, 0, columns * sizeof(REAL));
+    for (int64_t r = 0; r < rows; r++, light += light_pitch, sums += pitch)
+        for (int64_t x = 0; x < columns; x++) sums[pitch + x] = sums[x] + light[x];
+}
+
+// What a thread gathers a tile in.
+typedef struct {
+    uint8_t *seen;             // see list_members
+    REAL *sums;                // (channels, TILE_ROWS + side, pitch)
+    vec (*total)[2][ROWS];     // (channels,) of a block
+} desk;
+
+// Gathers a block whose first pixel is (y, x), in a tile from (top, left) on; its rows before `row` are written already.
+// Returns whether its layer indices are valid.
+INLINE int mix_block(const scene *s, const terms *t, const desk *d, int64_t pitch, int64_t image, int64_t top, int64_t left,
+                     int64_t y, int64_t x, int64_t row) {
+    const int64_t *index = s->index + image * s->index_image + y * s->index_row + x;
+    const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row + x : 0;
+    member members[TERMS];
+    labels l;
+    vec own[2][ROWS], weights[2][ROWS];
+    const int count = list_members(s, index, weight, d->seen, members);
+    read_labels(s, index, weight, &l);
+    memset(d->total, 0, s->channels * sizeof *d->total);
+    for (int n = 0; n < count; n++) {
+        const int strips = members[n].strips, first = strips == 2, last = strips != 1;
+        for (int strip = first; strip <= last; strip++) weigh(s, &l, strip, members[n].layer, weights[strip]);
+        for (int64_t c = 0; c < s->channels; c++) {
+            const int64_t psf = members[n].layer * s->channels + c, from = t->summed[psf] ? pitch : s->plane_row;
+            const REAL *light = t->summed[psf] ? d->sums + (c * (TILE_ROWS + s->side) + y - top) * pitch + x - left
+                                               : s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
+            if (strips == 3) convolve_block(t, psf, light, from, own);
+            else convolve_strip(t, psf, light + first * LANES, from, own + first);
+            for (int strip = first; strip <= last; strip++)
+                for (int v = 0; v < ROWS; v++) d->total[c][strip][v] += weights[strip][v] * own[strip][v];
         }
     }
-    for (int v = skip; v < ROWS; v++)
-        for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = total[strip][v];
+    for (int64_t c = 0; c < s->channels; c++) {
+        REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
+        for (int64_t v = row - y; v < ROWS; v++)
+            for (int strip = 0; strip < 2; strip++) *(loose *)(out + v * s->width + strip * LANES) = d->total[c][strip][v];
+    }
+    return count > 0;
 }
 
-// Gathers light: each pixel is convolved with the PSFs of its layers. Guided scheduling gives threads long runs of
-// adjacent bands, which weight light in the cache, and short runs at the end. Returns 0, or 1 for an invalid layer index.
+// Gathers light: each pixel is convolved with the PSFs of its layers. A thread takes TILE_ROWS rows of an image at a time, and
+// writes no other. Returns 0, 1 for an invalid layer index, or 2 if there is no memory.
 int mix(const scene *s) {
-    int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH;
+    const int64_t bands = (s->height + TILE_ROWS - 1) / TILE_ROWS, pitch = (TILE_COLUMNS + s->side - 1 + LANES) / LANES * LANES;
+    const int64_t plane = (TILE_ROWS + s->side) * pitch;
     int failed = 0;
-#pragma omp parallel for schedule(guided, 8) num_threads(s->threads)
-    for (int64_t band = 0; band < s->images * bands; band++) {
-        int64_t image = band / bands, y = least(band % bands * ROWS, s->height - ROWS);
-        const int64_t *index = s->index + image * s->index_image + y * s->index_row;
-        const REAL *weight = s->weight ? s->weight + image * s->weight_image + y * s->weight_row : 0;
-        int skip = band % bands * ROWS - y;  // rows of the previous band, which another thread may be writing
-        member members[TERMS];
-        for (int64_t block = 0; block < blocks; block++) {
-            int64_t x = least(block * WIDTH, s->width - WIDTH);
-            int count = list_members(s, index + x, weight ? weight + x : 0, members);
-            if (count == 0) {
+    terms t = {0};
+    if (!list_terms(s, pitch, &t)) failed = 2;
+    else
+#pragma omp parallel num_threads(s->threads)
+    {
+        desk d = {calloc(1, 2 * (s->layers + 1)), aligned_alloc(sizeof(vec), t.sums ? s->channels * plane * sizeof(REAL) : sizeof(vec)),
+                  aligned_alloc(sizeof(vec), s->channels * sizeof *d.total)};
+        const int taken = d.seen && d.sums && d.total;
+        if (!taken) {
 #pragma omp atomic write
-                failed = 1;
-            }
-            for (int64_t c = 0; c < s->channels; c++) {
-                const REAL *light = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
-                REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-                mix_block(s, light, index + x, weight ? weight + x : 0, members, count, s->psfs + c * s->side * s->side, out,
-                          skip);
+            failed = 2;
+        }
+#pragma omp for schedule(dynamic)
+        for (int64_t band = 0; band < s->images * bands; band++) {
+            const int64_t image = band / bands, first = band % bands * TILE_ROWS;
+            const int64_t top = least(first, s->height - ROWS), bottom = least(first + TILE_ROWS, s->height);
+            for (int64_t begin = 0; taken && begin < s->width; begin += TILE_COLUMNS) {
+                const int64_t left = least(begin, s->width - WIDTH), right = least(begin + TILE_COLUMNS, s->width);
+                const REAL *light = s->plane + image * s->plane_image + top * s->plane_row + left;
+                for (int64_t c = 0; t.sums && c < s->channels; c++)
+                    sum_columns(light + c * s->plane_channel, s->plane_row, bottom - top + s->side - 1,
+                                right - left + s->side - 1, d.sums + c * plane, pitch);
+                for (int64_t row = first; row < bottom; row += ROWS)
+                    for (int64_t column = begin; column < right; column += WIDTH) {
+                        const int64_t y = least(row, s->height - ROWS), x = least(column, s->width - WIDTH);
+                        if (mix_block(s, &t, &d, pitch, image, top, left, y, x, row)) continue;
+#pragma omp atomic write
+                        failed = 1;
+                    }
             }
         }
+        free(d.seen), free(d.sums), free(d.total);
     }
+    free_terms(&t);
     return failed;
 }
 
@@ -251,10 +332,12 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
             if (members[n].layer != layer) continue;
             int first = members[n].strips == 2, last = members[n].strips != 1;
             vec weights[2][ROWS];
+            labels l;
+            read_labels(s, s->index + image * s->index_image + p->y * s->index_row + p->x,
+                        s->weight ? s->weight + image * s->weight_image + p->y * s->weight_row + p->x : 0, &l);
             for (int strip = first; strip <= last; strip++) {
                 int64_t x = p->x + strip * LANES;
-                weigh(s, s->index + image * s->index_image + p->y * s->index_row + x,
-                      s->weight ? s->weight + image * s->weight_image + p->y * s->weight_row + x : 0, layer, weights[strip]);
+                weigh(s, &l, strip, layer, weights[strip]);
                 for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(gradient + (p->y + v) * s->width + x);
                 // Pixels of the overlap belong to the previous blocks.
                 if (p->skip_rows || p->skip_columns)
@@ -269,7 +352,7 @@ static void correlate_piece(const scene *s, int64_t image, int64_t channel, int6
 }
 
 // Computes the gradient in the PSFs: for each sample of each layer's PSF the correlation of the layer's pixels with the
-// light, in separate sums for slabs of rows. Returns 0, or 1 if there is no memory.
+// light, in separate sums for slabs of rows. Returns 0, or 2 if there is no memory.
 int correlate(const scene *s) {
     int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH, area = s->side * s->side;
     int64_t all = s->images * bands, failed = 0;
@@ -277,11 +360,11 @@ int correlate(const scene *s) {
     for (int64_t slab = 0; slab < s->slabs; slab++) {
         place places[PIECE_ROWS * PIECE_BLOCKS];
         member *members = malloc(sizeof(member) * PIECE_ROWS * PIECE_BLOCKS * TERMS);
-        char *present = malloc(s->layers + 1);
+        uint8_t *present = malloc(s->layers + 1), *seen = calloc(1, 2 * (s->layers + 1));
         vec *sums = aligned_alloc(sizeof(vec), area * sizeof(vec));
-        if (!members || !present || !sums) {
+        if (!members || !present || !seen || !sums) {
 #pragma omp atomic write
-            failed = 1;
+            failed = 2;
         } else
             for (int64_t top = all * slab / s->slabs, next; top < all * (slab + 1) / s->slabs; top = next) {
                 int64_t image = top / bands;
@@ -296,7 +379,7 @@ int correlate(const scene *s) {
                             int64_t x = least(block * WIDTH, s->width - WIDTH);
                             int found = list_members(
                                 s, s->index + image * s->index_image + y * s->index_row + x,
-                                s->weight ? s->weight + image * s->weight_image + y * s->weight_row + x : 0, members + end);
+                                s->weight ? s->weight + image * s->weight_image + y * s->weight_row + x : 0, seen, members + end);
                             for (int n = 0; n < found; n++) present[members[end + n].layer] = 1;
                             places[count++] = (place){y, x, band % bands * ROWS - y, block * WIDTH - x, end, end + found};
                             end += found;
@@ -309,7 +392,7 @@ int correlate(const scene *s) {
                         }
                 }
             }
-        free(members), free(present), free(sums);
+        free(members), free(present), free(seen), free(sums);
     }
     return failed;
 }

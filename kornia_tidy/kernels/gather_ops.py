@@ -1,5 +1,6 @@
 """Operators of gather by direct convolution: blurred light, and the gradient of the PSFs, in C.
 
+Light is gathered through PSFs of few pixels, and through discs and other PSFs of few terms (:func:`count_terms`).
 The renderer makes the gradient of the light, a transposed convolution, by the windows of ``overlap_ops.py``.
 """
 
@@ -9,6 +10,7 @@ import ctypes
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import KERNELS, load
 from kornia_tidy.kernels.operators import Parameters, define
@@ -16,6 +18,7 @@ from kornia_tidy.kernels.scene_checks import check_smallest, new_pixels, new_psf
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "direct.c"
+NO_LAYER, NO_MEMORY = 1, 2  # status of the functions
 STRIP_ROWS = 4  # of a strip of pixels, see direct.c
 SLABS = 4  # partial sums of a correlation for each thread: enough for all threads to end together
 SLAB_BYTES = 64 << 20  # limit of the memory of all partial sums
@@ -35,7 +38,8 @@ def gather_direct(
 
     Args:
         plane: L, (B, C, H + P - 1, W + P - 1) light on a processor, float32 or float64.
-        psfs: h, (D, C, P, P) with P odd, of the plane's dtype.
+        psfs: h, (D, C, P, P) with P odd, of the plane's dtype. Rounding through discs is relative to the largest light
+            in the P + 16 rows around a pixel, as sums of columns have it.
         layer_index: d, (B, H, W) int64.
         layer_weight: t, share of the next layer in [0, 1], (B, H, W) of the plane's dtype, or None for zero.
         weight_gradient: return :math:`\partial I_c / \partial t` instead.
@@ -73,6 +77,21 @@ def gather_direct_psf_gradient(
     return torch.ops.kornia_tidy.gather_direct_psf_gradient(plane, pixels, layer_index, layer_weight, layers)
 
 
+def count_terms(psfs: Tensor) -> int:
+    """Return the number of terms of all PSFs: as direct.c counts them, except that all PSFs take them of the same kind.
+
+    A disc's columns are runs of one value, of which sums of the light down its columns give each by its two ends.
+
+    Args:
+        psfs: (D, C, P, P).
+
+    Example:
+        >>> count_terms(torch.ones(1, 1, 33, 33)), count_terms(torch.rand(1, 1, 33, 33))
+        (66, 1089)
+    """
+    return min(int(psfs.count_nonzero()), int(pad(psfs, (0, 0, 1, 1)).diff(dim=-2).count_nonzero()))
+
+
 def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
     """Return the rows and columns of a block, below which an image is too small.
 
@@ -103,6 +122,14 @@ def _scene(
     return scene
 
 
+def _call(function: str, scene: _Scene, dtype: torch.dtype) -> None:
+    status = getattr(load(SOURCE, dtype), function)(ctypes.byref(scene))
+    if status == NO_LAYER:
+        refuse_layer(scene.layers)
+    if status == NO_MEMORY:
+        raise MemoryError(f"no memory for PSFs of {scene.side}x{scene.side} pixels")
+
+
 def _new_light(
     plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, weight_gradient: bool
 ) -> Tensor:
@@ -117,8 +144,7 @@ def _gather(
     light = _new_light(plane, psfs, layer_index, layer_weight, weight_gradient)
     scene = _scene(plane, layer_index, layer_weight, len(psfs), psfs.shape[-1], weight_gradient=weight_gradient)
     scene.point_to(psfs=psfs.flip((-2, -1)).mT, out=light)
-    if load(SOURCE, plane.dtype).mix(ctypes.byref(scene)):
-        refuse_layer(len(psfs))
+    _call("mix", scene, plane.dtype)
     return light
 
 
@@ -136,8 +162,7 @@ def _psf_gradient(
     sums = psfs.new_zeros(slabs, *psfs.shape)
     scene = _scene(plane, layer_index, layer_weight, layers, psfs.shape[-1], slabs=slabs)
     scene.point_to(gradient=pixels, out=sums)
-    if load(SOURCE, plane.dtype).correlate(ctypes.byref(scene)):
-        raise MemoryError(f"no memory to correlate with PSFs of {psfs.shape[-1]}x{psfs.shape[-1]} pixels")
+    _call("correlate", scene, plane.dtype)
     return sums.sum(0).flip((-2, -1))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from scipy import stats
 from torch import Tensor
-from torch.nn.functional import conv2d, one_hot
+from torch.nn.functional import conv2d, one_hot, pad
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.places import Places
@@ -94,14 +94,26 @@ class _Scene:
 
 
 def gather(draw: random.Random) -> Call:
-    """``mix`` of direct.c."""
-    scene = _gathered(draw)
+    """``mix`` of direct.c, through any PSFs and through discs, which take sums of the light down its columns."""
+    scene, discs = _gathered(draw), draw.random() < 0.4
+    if discs:
+        squared = torch.arange(scene.psfs.shape[-1]).sub(scene.psfs.shape[-1] // 2).square()
+        area = (draw.random() * scene.psfs.shape[-1] / 1.8) ** 2
+        one = torch.randn_like(scene.psfs[:, :, :1, :1])
+        scene = replace(scene, psfs=one * (squared + squared[:, None] <= area), about=f"discs {scene.about}")
     weight_gradient = scene.fraction is not None and draw.random() < 0.5
 
     def truth() -> tuple[Tensor, Tensor]:
         weights = _weights(scene, gradient=weight_gradient)
         expected, total = (_mixed(x(scene.light), x(scene.psfs), x(weights)) for x in (Tensor.double, _magnitudes))
-        return expected, 2 * gamma(scene.psfs.shape[-1] ** 2 + 4, scene.light.dtype) * total
+        side = scene.psfs.shape[-1]
+        allowed = 2 * gamma(side**2 + 4, scene.light.dtype) * total
+        if discs:  # each end of a run takes at most the light of a whole column
+            ends = pad(_magnitudes(scene.psfs), (0, 0, 1, 1)).diff(dim=-2).abs()
+            terms = int(ends.count_nonzero((-2, -1)).max()) + side + 16
+            reach = float(ends.sum((-2, -1)).max() * _magnitudes(scene.light).sum(-2).max())
+            allowed = allowed + gamma(terms, scene.light.dtype) * reach
+        return expected, allowed
 
     arguments = scene.light, scene.psfs, scene.lower, scene.fraction, weight_gradient
     about = f"{scene.about} weight_gradient {weight_gradient}"
@@ -521,7 +533,7 @@ def _light(draw: random.Random) -> tuple[Tensor, str]:
     if memory == "turned":
         image = image.T.contiguous().T if image.ndim == 2 else image.movedim(0, -1).contiguous().movedim(-1, 0)
     elif memory == "cut out":
-        image = torch.nn.functional.pad(image, (1, 2))[..., 1:-2]
+        image = pad(image, (1, 2))[..., 1:-2]
     elif memory == "shared":
         image = image[..., :1].expand(shape)
     return image, f"{dtype} {shape} {memory}"
@@ -733,7 +745,7 @@ def _gathered(draw: random.Random) -> _Scene:
     if memory == "shared by channels":
         light = light[:, :1].expand(-1, channels, -1, -1)
     elif memory == "cut out":
-        light = torch.nn.functional.pad(light, (0, 3, 0, 2))[..., : light.shape[-2], : light.shape[-1]]
+        light = pad(light, (0, 3, 0, 2))[..., : light.shape[-2], : light.shape[-1]]
     elif memory == "columns first":
         light = light.mT.contiguous().mT
     psfs = torch.randn(layers, channels, side, side, dtype=dtype)

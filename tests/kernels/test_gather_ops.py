@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from kornia_tidy.kernels.gather_ops import SOURCE, gather_direct, gather_direct_psf_gradient
+from kornia_tidy.augmentation.depth_blur import disc
+from kornia_tidy.kernels.gather_ops import SOURCE, count_terms, gather_direct, gather_direct_psf_gradient
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import SceneOperatorTester, needs_compiler
 
@@ -43,6 +44,21 @@ class TestGatherDirect(SceneOperatorTester):
         index = given["layer_index"][:1].expand(2, -1, -1)
         expected = gather_direct(plane.clone().contiguous(), given["psfs"], index.contiguous())
         assert torch.equal(gather_direct(plane, given["psfs"], index), expected)
+
+    @needs_compiler
+    @pytest.mark.parametrize("radius", [0.0, 0.7, 2.0, 5.0, 11.0, 16.0])
+    def test_feature_discs_take_few_terms_and_blur_as_the_definition(self, radius, dtype):
+        """Beside rows and columns of blocks and tiles, with the sharp layer beside the disc's."""
+        psfs = torch.stack([disc(0.0, 33), disc(radius, 33)]).to(dtype)[:, None]
+        plane = torch.rand(1, 1, 35 + 32, 301 + 32, dtype=dtype)
+        index, weight = torch.zeros(1, 35, 301, dtype=torch.int64), torch.rand(1, 35, 301, dtype=dtype)
+        sharp, blurred = torch.nn.functional.conv2d(plane.double(), psfs.double())[0]
+        expected = torch.lerp(sharp, blurred, weight[0].double())
+        # A term is at most the light of 49 rows, of which a column of a disc takes two ends of several terms.
+        self.assert_close(
+            gather_direct(plane, psfs, index, weight)[0, 0].double(), expected, rtol=0, atol=40 * torch.finfo(dtype).eps
+        )
+        assert count_terms(psfs[1:]) <= max(13 * radius, 10)
 
     @needs_compiler
     @pytest.mark.parametrize("layer", [-(2**63), -1, 3, 2**40])

@@ -1,7 +1,7 @@
 """The compiled backend: gather, scatter and occlusion in C, on processors.
 
-Small PSFs are convolved sample by sample (``direct.c``), larger ones by transforms of overlapping windows
-(``overlap.c``), each block or window with only the PSFs of its layers. Occlusion is convolved directly
+Small PSFs are convolved sample by sample and discs run by run (``direct.c``), other ones by transforms of overlapping
+windows (``overlap.c``), each block or window with only the PSFs of its layers. Occlusion is convolved directly
 (``occlusion.c``): all that is added up is positive, so float32 is enough, as the relative error of every sum is small,
 however small the normaliser that it becomes. Gradients of its PSFs and stray light are made in the same way, those of
 image and depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kernels.build`.
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
 from kornia_tidy.kernels.build import REALS, compiled
-from kornia_tidy.kernels.gather_ops import gather_direct, gather_direct_psf_gradient
+from kornia_tidy.kernels.gather_ops import count_terms, gather_direct, gather_direct_psf_gradient
 from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct_gradients
 from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient, scatter_overlap, window_size
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
@@ -100,9 +100,9 @@ class CompiledBackend:
                 tables = 2 * one.numel() * scene.field.nodes[1] * itemsize * torch.get_num_threads()
             return Work(operations, 2 * image + 32 * labels.layer_index.numel() + tables)
         kept = 16 * labels.layer_index.numel()
-        if _Sums(scene).directly:
+        if terms := _Sums(scene).terms:
             blended = 1 if labels.layer_weight is None else 2
-            return Work(2 * blended * words * pixels * side**2, 2 * image + kept)
+            return Work(2 * blended * words * pixels * terms, 2 * image + kept)
         height, width = labels.layer_index.shape[1:]
         sides, threads = (window_size(side), window_size(side)), torch.get_num_threads()
         if scene.field is not None:
@@ -129,14 +129,14 @@ class _Sums:
 
     def __init__(self, scene: LayeredScene) -> None:
         self.psfs, self.labels = scene.psfs.detach(), (scene.labels.layer_index, scene.labels.layer_weight)
-        self.size, self.directly, self.places = window_size(scene.psfs.shape[-1]), False, ()
+        self.size, self.places, self.terms = window_size(scene.psfs.shape[-1]), (), 0
         if scene.field is not None:
             self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
-        elif scene.compositing == "gather" and scene.psfs.shape[-1] <= LARGEST_DIRECT:
-            self.directly = _fits(scene, gather_ops.smallest_output(scene.image.dtype))
+        elif scene.compositing == "gather" and _fits(scene, gather_ops.smallest_output(scene.image.dtype)):
+            self.terms = _terms(self.psfs)
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
-        if self.directly:
+        if self.terms:
             return gather_direct(plane, self.psfs, *self.labels, weight_gradient=weight_gradient)
         options = {"correlate": correlate, "weight_gradient": weight_gradient, "places": self.places}
         return gather_overlap(plane, self.psfs, *self.labels, self.size, **options)
@@ -146,10 +146,24 @@ class _Sums:
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         given = plane, pixels, *self.labels, self.psfs.shape[-4]
-        if self.directly:
+        if self.terms and self.psfs.shape[-1] <= LARGEST_DIRECT:
             return gather_direct_psf_gradient(*given)
         found = overlap_psf_gradient(*given, self.size, correlate=correlate, places=self.places)
         return found.flatten(0, 1) if self.places else found
+
+
+def _terms(psfs: Tensor) -> int:
+    """Return the number of a PSF's terms where it is convolved directly, otherwise 0."""
+    count, side = psfs.shape[0] * psfs.shape[1], psfs.shape[-1]
+    if side <= LARGEST_DIRECT:
+        return side**2
+    if not psfs.stride(-1):  # one number for all samples, of which work is counted
+        return 0
+    # Most pairs of neighbours in the middle of a disc are equal, and in that of other PSFs none is.
+    if 2 * int(psfs[..., side // 2].diff(dim=-1).count_nonzero()) > count * side:
+        return 0
+    terms = -(-count_terms(psfs) // count)
+    return terms if 2 * terms <= side**2 else 0
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
