@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
 
 from tests.base import BaseTester
-from tests.code_mutants.mutants import KINDS, draw_mutants, mutants_of
-from tests.code_mutants.trial import chosen_tests, within
+from tests.code_mutants.mutants import KINDS, mutants_of
 
-ROOT = Path(__file__).resolve().parents[1]
 
 PYTHON = b'''
 class Bank:
@@ -58,26 +54,3 @@ class TestMutants(BaseTester):
         assert loop.replace("i < n", "i <= n").format("+=", "-") in found["off-by-one"]
         assert loop.format("=", "-") in found["gradient"]
         assert found["memory"] == {";"}
-
-    def test_feature_a_seed_draws_the_same_and_kinds_take_turns(self):
-        drawn = draw_mutants(ROOT, 18, seed=3)
-        assert drawn[:12] == draw_mutants(ROOT, 12, seed=3)
-        assert [m.kind for m in drawn] == 3 * list(KINDS)
-        assert len({*drawn}) == 18
-        for mutant in drawn:
-            if mutant.path.endswith(".py"):
-                ast.parse(mutant.apply((ROOT / mutant.path).read_bytes()))
-
-    def test_feature_the_likeliest_tests_come_first(self):
-        [mutant] = [m for m in mutants_of("kornia_tidy/psf/bank.py", PYTHON) if m.kind == "gradient"]
-        own = "kornia_tidy/psf/bank.py:Bank.recall"
-        calls = {
-            "tests/camera/test_a.py::far": (0.1, [own]),
-            "tests/psf/test_b.py::slow": (3.0, [own]),
-            "tests/psf/test_b.py::other": (0.1, ["kornia_tidy/psf/bank.py:Bank.save"]),
-            "tests/psf/test_bank.py::own": (2.0, [own]),
-            "tests/psf/test_bank.py::beside": (0.1, []),
-        }
-        tests = chosen_tests(mutant, calls, ROOT)
-        assert [test.rpartition("::")[2] for test in tests] == ["own", "slow", "far", "beside"]
-        assert within(tests, calls, 5.0) == 2

@@ -28,7 +28,7 @@ import torch
 from PIL import Image
 
 from kornia_tidy.cli import main
-from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
+from kornia_tidy.data import read_image
 from tests.augmentation.optional import need_torchvision
 from tests.base import BaseTester
 from tests.data.published import write_each
@@ -286,54 +286,3 @@ class TestEveryPage(BaseTester):
 
 def page(*parts: str) -> str:
     return "\n".join(parts) + "\n"
-
-
-class TestRunPage(BaseTester):
-    """Faults that are planted in a page are found."""
-
-    def test_feature_blocks_share_names_and_prints_are_compared(self, folder):
-        run_page(
-            "p.md", page("```python", "x = 1", "```", "", "```python", "print(x, 2)", "```", "```text", "1 ...", "```")
-        )
-
-    def test_exception_another_print(self, folder):
-        with pytest.raises(AssertionError, match=r"p\.md:4 shows\s+2\s+but printed is\s+1"):
-            run_page("p.md", page("```python", "print(1)", "```", "```text", "2", "```"))
-
-    def test_exception_a_command_that_fails(self, folder):
-        with pytest.raises(AssertionError, match=r"p\.md:1 ends with 2: kornia-tidy simulate gone\.png --depth depth"):
-            run_page("p.md", page("```bash", "kornia-tidy simulate gone.png \\", "    --depth depth.png", "```"))
-
-    def test_feature_a_block_that_needs_a_package_is_run_where_it_is(self, folder):
-        block = page("<!-- needs: {} -->", "```python", "print(1 / {})", "```", "```text", "1.0", "```")
-        run_page("p.md", block.format("gone", 0))
-        run_page("p.md", block.format("torch", 1))
-        with pytest.raises(ZeroDivisionError):
-            run_page("p.md", block.format("torch", 0))
-        with pytest.raises(SyntaxError):
-            run_page("p.md", block.format("gone", ")"))
-
-    def test_feature_options_are_appended_to_the_commands(self, folder):
-        image, depth = dead_leaves(96, 128, depth_range=(0.4, 3.0), num_leaves=60)
-        write_image(folder / "photo.png", image)
-        write_depth(folder / "depth.png", depth, scale=0.001)
-        lines = ("```bash", "kornia-tidy simulate photo.png --depth depth.png --depth-scale 0.001 -o a.png", "```")
-        run_page("p.md", page("<!-- slow: a second -->", "<!-- run with: -o b.png -->", *lines), slow=True)
-        assert [path.name for path in folder.glob("?.png")] == ["b.png"]
-
-    @pytest.mark.parametrize(
-        ("language", "line", "match"),
-        [
-            ("python", "from kornia_tidy import Gone", "imports .'Gone'., which kornia_tidy has not"),
-            ("bash", "make gone", r"p\.md:2: make: .*No rule to make target .gone."),
-            ("bash", "make test ARGS=--gone", "p.md:2: .*unrecognized arguments: --gone"),
-            ("bash", "kornia-tidy render -o out --gone", "p.md:2: there is no --gone"),
-            ("bash", "python gone.py", r"there is no gone\.py"),
-            ("bash", "OMP_NUM_THREADS=1 python -m tests.gone", r"there is no tests\.gone"),
-            ("bash", "pip install '.[plot,gone]'", r"there are no extras .*'gone'"),
-        ],
-    )
-    def test_exception_what_is_seldom_run_and_not_there(self, language, line, match, capsys):
-        (block,) = blocks("p.md", page("<!-- slow: why -->", f"```{language}", line, "```"))
-        with pytest.raises(AssertionError, match=match):
-            check_names(block) if language == "python" else check_arguments(shell_lines(block)[0], block.place)

@@ -98,10 +98,6 @@ class TestSimulatePhoto(BaseTester):
         assert runs[0].shape == (70, 80, 3)
         assert torch.equal(*runs)
 
-    def test_feature_a_scene_too_near_for_the_default_lens_gets_its_own(self, example):
-        camera = example.camera_for(torch.tensor([0.1, 0.3]))
-        self.assert_close(camera.defocus(torch.tensor([0.1, 0.3])), torch.tensor([20.0, -20.0]), atol=1e-3)
-
     def test_exception_image_and_depth_go_together(self, example, capsys):
         with pytest.raises(SystemExit):
             example.main(["--image", "a.png"])
@@ -132,13 +128,6 @@ class TestLearnPointPSF(BaseTester):
         assert max(error for errors in finals.values() for error in errors) < plain
         assert picture(tmp_path / "learn_point_psf.png").float().std() > 20
 
-    def test_feature_the_error_is_the_squared_distance_to_the_impulse(self, example):
-        optics = example.TiDyOptics(example.PixelwiseMask(2), fidelity=example.FIDELITY)
-        psfs = optics.psf_bank(channels=1).psfs
-        impulse = torch.zeros_like(psfs)
-        impulse[..., 11, 11] = 1
-        self.assert_close(example.point_error(optics), (psfs - impulse).square().sum((1, 2, 3)).mean())
-
 
 @pytest.mark.parametrize("example", ["nonconvex_psfs"], indirect=True)
 class TestNonconvexPSFs(BaseTester):
@@ -162,10 +151,6 @@ class TestMaskFamilies(BaseTester):
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) == 2 + len(histories)
         assert lines[2].startswith("pixelwise  point")
-
-    def test_feature_steps_are_counted_to_the_first_below_the_goal(self, example):
-        assert example.steps_to(0.5, [0.9, 0.7, 0.4, 0.6]) == 2
-        assert example.steps_to(0.5, [0.9, 0.7]) is None
 
 
 @pytest.mark.parametrize("example", ["learn_with_switching"], indirect=True)

@@ -116,6 +116,7 @@ EXEMPT = {
     "RenderPlan": ({"feature", "exception"}, RECORD),
     "ResolvedPSF": ({"feature", "exception"}, RECORD),
     "Restoration": ({"feature", "exception"}, RECORD),
+    "System": ({"feature", "exception"}, "plain data: tested as the entries of SYSTEMS, test_published_systems.py"),
     "TradeRow": ({"feature", "exception"}, RECORD),
     "depth_at": ({"exception"}, REFUSES_NOTHING),
     "draw_depth": ({"exception"}, REFUSES_NOTHING),

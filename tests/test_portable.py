@@ -8,7 +8,7 @@ import pytest
 
 from tests import portable
 from tests.base import BaseTester
-from tests.portable import FACTORS, Factor, Machine, Outcome, main
+from tests.portable import FACTORS, Factor, Machine
 
 PLAIN = Machine("a processor", portable.V2, {"aten": "DEFAULT", "mkl": "0"})
 USED = {"aten": "DEFAULT", "mkl": "1", "compiled": True, "threads": 1}
@@ -50,24 +50,3 @@ class TestPortable(BaseTester):
         assert (outcome is None) == (reason is None)
         if reason:
             assert re.search(reason, str(outcome))
-
-    @pytest.mark.usefixtures("probed")
-    def test_feature_the_table_has_what_was_run_and_what_was_not(self, monkeypatch, capsys):
-        def run(factor, machine, tests):
-            return Outcome(factor.name, tests=2, passed=1, failed=int(factor.name == "threads 2"), remark="why")
-
-        monkeypatch.setattr(portable, "run", run)
-        assert main(["--only", "aten"]) == 0
-        assert main(["--only", "threads"]) == 1
-        told = capsys.readouterr().out
-        for name in ("aten default", "aten avx2", "aten avx512", "threads 1", "threads 2"):
-            assert f"| {name} | 2 | 1 |" in told
-        assert "onemkl" not in told
-
-    def test_feature_only_the_factor_differs(self, monkeypatch):
-        monkeypatch.setenv("CC", "mine")
-        monkeypatch.setenv("OMP_NUM_THREADS", "7")
-        made = portable.environment({"MKL_CBWR": "COMPATIBLE"})
-        assert "CC" not in made
-        assert (made["OMP_NUM_THREADS"], made["MKL_CBWR"]) == ("1", "COMPATIBLE")
-        assert portable.drop_nested(["tests/a", "tests/a/b.py", "tests/a", "tests/c.py"]) == ["tests/a", "tests/c.py"]

@@ -99,16 +99,3 @@ class TestPrivateAttributes(BaseTester):
     )
     def test_feature_the_rule_sees_every_way_to_write(self, line):
         assert foreign_writes(f"def f(self, other):\n    {line}\n")
-
-    @pytest.mark.parametrize(
-        "lines",
-        [
-            "self._x = 1",
-            "other = cls()\n    other._x = 1",
-            "other = object.__new__(type(self))\n    vars(other).update(_x=1)",
-            "other.x = 1",
-            "y = other._x",
-        ],
-    )
-    def test_feature_the_rule_lets_pass_what_is_one_s_own(self, lines):
-        assert foreign_writes(f"def f(self, cls, other):\n    {lines}\n") == []

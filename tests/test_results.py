@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
-from torch import nn
 
-from kornia_tidy.design.candidates import FLAT as FLAT_LENS
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
-from kornia_tidy.reconstruction.hub import save_pretrained
-from kornia_tidy.reconstruction.pretrained import load_pretrained
-from kornia_tidy.reconstruction.settings import SystemSettings
-from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics
 from tests.base import BaseTester
-from tests.benchmarks import depth_uncertainty
 from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
-from tests.benchmarks.results import measure
-from tests.benchmarks.results.captures import FIXED, PHYSICAL, Capture, capture, sensor_of
+from tests.benchmarks.results.captures import FIXED, PHYSICAL, sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
-from tests.benchmarks.results.report import page
-from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK, restorations_for
+from tests.benchmarks.results.restorations import ENSEMBLE, NETWORK, restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
-from tests.benchmarks.results.scores import best_ramp, depth_scores, local_contrast, ramp, score
+from tests.benchmarks.results.scores import depth_scores, local_contrast
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
-from tests.benchmarks.results.systems import WINDOW, System, available, from_checkpoint, of_trained
+from tests.benchmarks.results.systems import available
 from tests.benchmarks.results.table import Key, Results, paired
-from tests.benchmarks.results.verdicts import FIVE, JOINT, ONE, REAL, recommendations, verdicts
+from tests.benchmarks.results.verdicts import FIVE, JOINT, ONE, REAL, verdicts
 from tests.scenes import halves
 
 HERE = Provenance("2026-11-22", "0000000", "a test")
@@ -84,39 +74,6 @@ class TestNoise(BaseTester):
             expected = 0.5 / electrons + (2.4 / electrons) ** 2
             assert variances[number] == pytest.approx(expected, rel=5 * math.sqrt(2 / 40000))  # five standard errors
 
-    def test_feature_systems_get_the_same_random_numbers(self):
-        scene = dead_leaves(1, 32).load("leaves 00")
-        taken = [capture(available()[name](), scene, scene.image, "0.01") for name in (FLAT, "flat f/25")]
-        assert torch.equal(taken[0].light, taken[1].light)
-        assert not torch.equal(taken[0].light, capture(taken[0].system, scene, scene.image, "0.002").light)
-
-
-class TestSystems(BaseTester):
-    def test_feature_kinds_are_told_from_the_masks(self):
-        makers = available()
-        kinds = {name: makers[name]().kind for name in ("edof-5", FLAT, "preset chang2019")}
-        assert list(kinds.values()) == ["coded", "flat", "published"]
-
-    def test_feature_psfs_of_129_pixels_and_stray_light_hold_all_light(self):
-        bank = available()["edof-1"]().optics.psf_bank(defocus=[-20.0, 0.0])
-        assert bank.window == WINDOW == 129
-        self.assert_close(bank.psfs.sum((-2, -1)) + bank.veil, torch.ones(2, 3))
-
-    def test_feature_other_weights_are_another_system(self):
-        makers = available()
-        assert makers[FLAT]().digest == makers[FLAT]().digest != makers["flat f/60"]().digest
-        trained = load_pretrained("edof-flat")
-        before = of_trained("a", trained).digest
-        with torch.no_grad():
-            next(trained.head.parameters()).add_(1.0)
-        assert of_trained("a", trained).digest != before
-
-    def test_feature_a_folder_with_its_own_aperture_and_without_masks(self, tmp_path):
-        settings = SystemSettings(masks=1, start="flat", f_number=48.0, window=9, head="plain", width=2)
-        lens = TrainedSystem(build_optics(settings), build_head(settings), settings, 0)
-        system = from_checkpoint(save_pretrained(lens, tmp_path / "slow"))
-        assert (system.name, system.kind, system.title) == ("slow", "flat", "flat lens, f/48")
-
 
 GRID = {"a": tuple(2.0**power for power in range(9)), "b": (1.0, 3.0, 9.0)}
 
@@ -134,70 +91,12 @@ class TestSearch(BaseTester):
         assert len(asked) == len(set(asked)) < len(GRID["a"]) * len(GRID["b"])
 
 
-class TestRestorations(BaseTester):
-    def test_feature_a_network_is_told_the_noise_and_wrong_levels_of_it(self):
-        told = []
-
-        class Head(nn.Module):
-            def forward(self, image, noise=None):
-                told.append(noise)
-                return image
-
-        flat = available()[FLAT]()
-        system = System("mine", "coded", flat.optics, Head(), "edof", "")
-        found = restorations_for(system)
-        light = torch.rand(1, 3, 16, 16)
-        for noise in ("0.01", "10000e"):
-            taken = capture(system, dead_leaves(1, 16).load("leaves 00"), light, noise)
-            for name in (NETWORK, f"{NETWORK}, noise x 0.5", f"{NETWORK}, noise x 2"):
-                self.assert_close(found[name].restore(taken, {})["image"], taken.image)
-        assert [noise.shape for noise in told[:3]] == [(1, 1, 1, 1)] * 3
-        self.assert_close(torch.stack(told[:3]).flatten(), torch.tensor([0.01, 0.005, 0.02]))
-        electrons = 10000 * (17.6 / 50) ** 2
-        self.assert_close(told[3].square(), taken.light / electrons + (2.4 / electrons) ** 2)
-        self.assert_close(told[4], told[3] / 2)
-
-    def test_feature_tikhonov_undoes_a_flat_lens(self):
-        system, scene = available()[FLAT](), dead_leaves(1, 72).load("leaves 00")
-        light = measure.irradiance(system, scene)
-        restored = restorations_for(system)[TIKHONOV].restore(
-            Capture(light, system, torch.zeros(1, 1, 1, 1)), {"weight": 1e-3}
-        )
-        before, after = (
-            (image - scene.image).square().mean() for image in (Capture(light, system, light).image, restored["image"])
-        )
-        assert after < 0.7 * before
-
-    def test_feature_the_inversion_by_depth_takes_the_psf_of_the_depth(self):
-        """A scene at one depth that the network knows: better than the mean PSF, and than a wrong depth."""
-        flat = available()["flat f/25"]()
-        scene = dead_leaves(1, 96).load("leaves 00")._replace(inverse_depth=torch.full((1, 1, 96, 96), 0.82))
-        light, errors = measure.irradiance(flat, scene), []
-        for guess in (0.82, 0.5, None):
-            head = nn.Conv2d(3, 4, 1, bias=True)
-            nn.init.zeros_(head.weight)
-            nn.init.constant_(head.bias, guess or 0.0)
-            taken = Capture(light, System("mine", "coded", flat.optics, head, "joint", ""), torch.zeros(1, 1, 1, 1))
-            found = restorations_for(taken.system)[TIKHONOV if guess is None else BY_DEPTH]
-            with torch.inference_mode():
-                errors.append((found.restore(taken, {"weight": 1e-3})["image"] - scene.image).square().mean().item())
-        assert errors[0] < 0.8 * min(errors[1:])
-        assert BY_DEPTH not in restorations_for(flat)
-
-
 class TestScores(BaseTester):
     @staticmethod
     def scene(depth, image=None, known=None):
         image = torch.rand(1, 3, *depth.shape[-2:]) if image is None else image
         known = torch.ones_like(depth, dtype=torch.bool) if known is None else known
         return BenchScene("made", image, depth, known)
-
-    def test_feature_local_contrast_is_the_standard_deviation(self):
-        image = torch.rand(1, 3, 21, 23)
-        luma = (torch.tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1) * image.double()).sum(1)
-        expected = np.std(luma[0, 6:15, 3:12].numpy())
-        assert local_contrast(image)[0, 0, 10, 7].item() == pytest.approx(expected, rel=1e-6)
-        assert local_contrast(torch.full((1, 3, 16, 16), 0.7)).max() < 1e-6
 
     def test_feature_textured_and_textureless_pixels_apart(self):
         image = torch.full((1, 3, 40, 40), 0.5)
@@ -214,27 +113,6 @@ class TestScores(BaseTester):
         whole = blank * scores["depth_textureless"] ** 2 + (1 - blank) * scores["depth_textured"] ** 2
         assert scores["depth"] == pytest.approx(math.sqrt(whole))
 
-    def test_feature_the_surest_are_those_of_least_deviation(self):
-        """Six of twenty columns are unsure and wrong; unknown pixels do not count."""
-        depth, deviation = torch.zeros(1, 1, 12, 20), torch.full((1, 1, 12, 20), 0.1)
-        estimate, known = depth + 0.05, torch.ones_like(depth, dtype=torch.bool)
-        estimate[..., 14:], deviation[..., 14:] = 0.9, 0.3
-        estimate[..., :2, :], known[..., :2, :] = 0.5, False
-        scene = self.scene(depth, known=known)
-        maps = {"image": scene.image, "depth": estimate, "deviation": deviation}
-        assert score(scene, maps)["depth_surest"] == pytest.approx(0.05, rel=1e-5)
-        del maps["deviation"]
-        assert "depth_surest" not in score(scene, maps)
-
-    def test_feature_a_ramp_is_found_behind_holes(self):
-        rows = torch.linspace(0, 1, 30)[:, None].expand(30, 20)
-        known = torch.rand(1, 1, 30, 20) > 0.5
-        depth = (0.2 + 0.5 * rows)[None, None]
-        holes = depth.masked_fill(~known, 7.0)
-        top, bottom = best_ramp([self.scene(holes, known=known)])
-        assert (top, bottom) == (pytest.approx(0.2), pytest.approx(0.7))
-        self.assert_close(ramp(self.scene(holes, known=known), top, bottom), depth)
-
 
 class TestPaired(BaseTester):
     def test_feature_mean_and_standard_error_of_the_differences(self):
@@ -243,10 +121,6 @@ class TestPaired(BaseTester):
         assert found.mean == pytest.approx(np.mean(differences))
         assert found.error == pytest.approx(stats.sem(differences))
         assert (found.ahead, found.pairs) == (sum(value > 0 for value in differences), 6)
-
-    def test_feature_what_is_not_a_number_does_not_count(self):
-        assert paired({"a": math.nan, "b": 2.0, "c": 1.0}, {"a": 1.0, "b": 1.0}).pairs == 1
-        assert math.isnan(paired({}, {}).mean)
 
 
 class TestResults(BaseTester):
@@ -319,28 +193,6 @@ class TestResults(BaseTester):
         assert found[f"500 electrons, networks: {FIVE} over {FLAT}"].measured.startswith("-2.00 ± 0.00 (0 of 3")
         assert met["57,000 electrons, closed forms: coded over flat"] is None
 
-    def test_feature_what_a_design_recommends_may_lose_by_two_standard_errors(self, tmp_path):
-        scenes = real_like()
-        gains = dict(zip(scenes.names, (0.0, 0.6, -0.2) * len(scenes.names), strict=False))
-        scores = {}
-        for noise, sign in (("57000e", 1), ("2000e", -1)):
-            coded = {name: {"psnr": 26.0 + sign * gain, "ssim": 0.9} for name, gain in gains.items()}
-            scores |= {(noise, FLAT, NETWORK): scored(scenes, 26.0), (noise, FIVE, NETWORK): coded}
-        scores |= {("500e", FLAT, NETWORK): scored(scenes, 26.0), ("500e", FIVE, NETWORK): scored(scenes, 25.0)}
-        for noise, start in {"57000": FLAT_LENS, "2000": "focal sweep", "500": "focal sweep"}.items():
-            report = {"task": {"electrons": 4 * float(noise), "reference_f_number": 8.8}}
-            report["recommended"] = {"start": start}
-            (tmp_path / noise).mkdir()
-            (tmp_path / noise / "report.json").write_text(json.dumps(report))
-        recommended = recommendations([tmp_path / noise for noise in ("57000", "2000", "500")])
-        assert recommended == {"57000e": "flat", "2000e": "coded", "500e": "coded"}
-        rows = verdicts(synthetic(scores, [scenes]), recommended)
-        assert [row.met for row in rows if "design recommends" in row.claim] == [True, True, False]
-        report["task"]["electrons"] = 9
-        (tmp_path / "500" / "report.json").write_text(json.dumps(report))
-        with pytest.raises(ValueError, match=r"is a design for 2 electrons at f/17.6, not measured"):
-            recommendations([tmp_path / "500"])
-
 
 class TestStore(BaseTester):
     CELL = Cell("real", "a", "flat", "00ff", "0.01", "capture", "")
@@ -354,12 +206,6 @@ class TestStore(BaseTester):
             assert store.get(self.CELL)["psnr"] == 20.5
             assert store.get(self.CELL._replace(noise="0.002")) == {}
         assert (found.cell, found.provenance) == (self.CELL, HERE)
-
-    def test_feature_values_of_other_weights_are_left_out(self, tmp_path):
-        with Store(tmp_path / "s.sqlite", HERE) as store:
-            store.put(self.CELL, {"psnr": 20.5})
-            store.put_system(SystemRow("flat", "1234", "flat", "another lens", 50.0))
-            assert store.cells() == []
 
 
 class TestMeasurement(BaseTester):
@@ -395,30 +241,18 @@ class TestMeasurement(BaseTester):
         assert candidates > 0
 
 
-@pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("results")
-    command.main([str(folder), "--quick"])
-    return folder
-
-
 class TestCommand(BaseTester):
-    def test_smoke_quick_writes_page_table_and_picture(self, quick):
-        text = (quick / "results.md").read_text()
+    def test_smoke_quick_writes_page_table_and_picture(self, tmp_path):
+        command.main([str(tmp_path), "--quick"])
+        text = (tmp_path / "results.md").read_text()
         assert "## Dead leaves, noise 0.002" in text
         for system in command.QUICK_SYSTEMS:
             assert f"| `{system}` |" in text
-        with (quick / "results.csv").open(newline="") as file:
+        with (tmp_path / "results.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         assert {row["half"] for row in rows} == {"A", "B"}
         assert all(10 < float(row["psnr"]) < 60 for row in rows if row["system"] != NO_CAMERA)
-        assert (quick / "images" / "results.png").read_bytes().startswith(b"\x89PNG")
-
-    def test_feature_a_second_run_measures_nothing(self, quick, monkeypatch):
-        monkeypatch.setattr(measure, "irradiance", lambda *_: pytest.fail("measured again"))
-        before = (quick / "results.csv").read_bytes()
-        command.main([str(quick), "--quick"])
-        assert (quick / "results.csv").read_bytes() == before
+        assert (tmp_path / "images" / "results.png").read_bytes().startswith(b"\x89PNG")
 
     @pytest.mark.parametrize(
         ("arguments", "match"),
@@ -431,31 +265,8 @@ class TestCommand(BaseTester):
         with pytest.raises(SystemExit, match=match):
             command.main([str(tmp_path), *arguments])
 
-    def test_feature_the_page_says_what_is_missing(self):
-        cell = Measured(Cell(REAL, "s0", FLAT, "", "0.01", "capture", ""), {"psnr": 20.0}, HERE)
-        text = page(synthetic({("0.01", FLAT, "capture"): scored(real_like(), 20.0)}, [real_like()]), [cell])
-        assert "Measured 2026-11-22 at commit 0000000: a test." in text
-        assert "LPIPS was not measured" in text
-        assert "Dead leaves: not measured yet." in text
-        assert "Real scenes: not measured yet." not in text
-        assert "Not measured yet: noise 0.002, noise 0.03, 57,000 electrons" in text
-
 
 class TestDepthUncertainty(BaseTester):
-    @pytest.fixture(autouse=True)
-    def painted(self, monkeypatch):
-        monkeypatch.setattr(depth_uncertainty, "real_scenes", lambda: dead_leaves(6, 96))
-
-    def test_smoke_a_row_of_errors_and_of_their_prediction(self):
-        line = depth_uncertainty.row(available()["joint-uncertain"](), FIXED[0])
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        assert cells[:2] == ["joint-uncertain", FIXED[0]]
-        textured, everywhere, surest = (float(cell.split(" ± ")[0]) for cell in cells[2:5])
-        assert 0 < surest < everywhere < 0.4
-        assert 0 < textured < 0.4
-        assert 0 < float(cells[5]) < 0.4
-        assert cells[6].endswith(" %")
-
     def test_feature_variances_of_a_fitted_temperature_are_as_large_as_squared_errors(self):
         generator = torch.Generator().manual_seed(0)
         logits = 9 * torch.randn(2, 9, 20, 20, generator=generator)

@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import pkgutil
 import re
-import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -81,15 +80,6 @@ class TestGallery(BaseTester):
         index = (tmp_path / "pages" / "index.md").read_text(encoding="utf-8")
         assert "\n".join([*card, "", "A question. Two sentences.", *instead, ":::"]) in index
 
-    def test_feature_an_example_runs_again_only_after_a_change(self, tmp_path, example, capsys):
-        path = example("None")
-        self.make(tmp_path, path)
-        assert "examples/my_example.py" in capsys.readouterr().out
-        self.make(tmp_path, path)
-        assert capsys.readouterr().out == ""
-        self.make(tmp_path, example("(1, 2)"))
-        assert "examples/my_example.py" in capsys.readouterr().out
-
     def test_feature_titles_and_arguments_are_of_examples_that_are_there(self):
         there = {path.stem for path in (SITE.parents[1] / "examples").glob("*.py")}
         assert set(gallery.TITLES) == there
@@ -135,18 +125,6 @@ class TestApiPages(BaseTester):
         assert {name: pages for name, pages in places.items() if len(pages) > 1} == {}
         assert [name for name in homes if len(places[name]) != 1] == []
 
-    @pytest.mark.parametrize(
-        ("text", "expected"),
-        [
-            ("from kornia_tidy import TiDyOptics\n", {"kornia_tidy": {"TiDyOptics"}}),
-            ("  from kornia_tidy.a import (\n  c as d,  # from e import f\n  g,\n)\n", {"kornia_tidy.a": {"c", "g"}}),
-            ("import kornia_tidy\nfrom kornia import augmentation\n", {}),
-        ],
-    )  # fmt: skip
-    def test_feature_imports_of_a_page(self, tmp_path, text, expected):
-        (tmp_path / "page.md").write_text(text)
-        assert api_pages.imports([tmp_path / "page.md"]) == expected
-
 
 class TestFlowChart(BaseTester):
     @pytest.mark.parametrize("text", CHARTS)
@@ -167,49 +145,3 @@ class TestFlowChart(BaseTester):
         ends = [re.findall(r"[\d.-]+", path) for path in re.findall(r'<path d="([^"]*)"', svg)]
         assert len(ends) == len(chart.arrows)
         assert all(float(end[-1]) > float(end[1]) for end in ends)
-
-
-class TestFormulas(BaseTester):
-    def test_feature_commands_become_signs_and_unknown_ones_are_told(self, monkeypatch):
-        pytest.importorskip("latex2mathml", reason="latex2mathml is not installed (extra 'docs')")
-        pytest.importorskip("docutils", reason="docutils is not installed (extra 'docs')")
-        monkeypatch.setattr(sys, "path", [str(SITE), *sys.path])
-        formula = load("drawn_in_page").formula
-        assert "&#x003C8;" in formula(r"\psi", "inline")
-        assert "<mtable" in formula(r"a &= b \\ c &= d", "block")
-        with pytest.raises(ValueError, match=r"\\nonsense cannot be written as MathML"):
-            formula(r"\nonsense x", "inline")
-
-
-class TestDocstrings(BaseTester):
-    """How conf.py rewrites what Sphinx reads; none of it needs Sphinx."""
-
-    @pytest.fixture
-    def conf(self, monkeypatch):
-        """Its references are looked up in one package: to import all of them takes seconds."""
-        monkeypatch.setattr(sys, "path", list(sys.path))
-        conf = load("conf")
-        found = [pkgutil.ModuleInfo(None, "kornia_tidy.optics", ispkg=True)]
-        found += pkgutil.iter_modules(kornia_tidy.optics.__path__, "kornia_tidy.optics.")
-        monkeypatch.setattr(conf.references.pkgutil, "walk_packages", lambda *_: found)
-        conf.references.defined.cache_clear()
-        return conf
-
-    def test_feature_a_property_keeps_its_sentence(self, conf):
-        lines = ["Height in metres: the mask's."]
-        conf.keep_sentences_of_properties(None, "property", "height", None, None, lines)
-        assert lines == ["\\", "Height in metres: the mask's."]
-        conf.keep_sentences_of_properties(None, "function", "height", None, None, lines)
-        assert len(lines) == 2
-
-    @pytest.mark.parametrize(
-        ("target", "full"),
-        [
-            ("thin_lens_defocus", ["kornia_tidy.optics.thin_lens.thin_lens_defocus"]),
-            ("kornia_tidy.optics", ["kornia_tidy.optics"]),
-            ("ThinLensCamera.defocus", ["kornia_tidy.optics.thin_lens.ThinLensCamera.defocus"]),
-            ("gone_from_here", []),
-        ],
-    )
-    def test_feature_references_have_one_full_name(self, conf, target, full):
-        assert conf.references.full_names(target) == full

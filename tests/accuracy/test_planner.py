@@ -188,7 +188,7 @@ class TestTolerance(BaseTester):
         assert 1 < scene.error(fidelity) / measured < 2.5
 
     @needs_data
-    @pytest.mark.parametrize("wavelengths", [3, 5, 7])
+    @pytest.mark.parametrize("wavelengths", [3, 7])
     def test_feature_every_number_of_wavelengths_is_predicted(self, wavelengths, spectral):
         light, defocus = real_scene(NAMES[0], spectral.optics, 96)
         scene = spectral.planner.scene(defocus, light)
@@ -265,7 +265,7 @@ class TestPlan(BaseTester):
         generator = torch.Generator().manual_seed(1)
         light = IMAGES["smooth"]((1, 3, 48, 48), generator)
         scene = spectral.planner.scene(20 * DEPTHS["smooth"]((1, 1, 48, 48), generator) - 18, light)
-        counts = [scene.plan(tolerance).wavelengths[0] for tolerance in (*TOLERANCES, 1e-12)]
+        counts = [scene.plan(tolerance).wavelengths[0] for tolerance in (1e-1, 1e-6, 1e-12)]
         assert counts[0] <= 3
         assert counts[0] < counts[-2]
         assert counts[-1] == len(spectral.optics.spectrum.wavelengths)

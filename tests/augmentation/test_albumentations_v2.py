@@ -64,12 +64,18 @@ class TestOpticsTransform(BaseTester):
 
     def test_feature_masks_boxes_and_other_entries_pass(self):
         given = {**arrays(), "mask": np.eye(40, 48, dtype=np.uint8), "label": 3}
+        given["masks"], points = np.stack([given["mask"]] * 2), np.array([[3.5, 4.5]], np.float32)
         boxes = np.array([[3, 4, 10, 12]], np.float32)
-        chain = A.Compose(
-            [OpticsTransform(camera())], bbox_params=A.BboxParams("pascal_voc", label_fields=["kinds"]), **DEPTH
-        )
-        out = chain(**given, bboxes=boxes, kinds=[1])
+        kinds = {
+            "bbox_params": A.BboxParams("pascal_voc", label_fields=["kinds"]),
+            "keypoint_params": A.KeypointParams("xy"),
+        }
+        transform = OpticsTransform(camera())
+        out = A.Compose([transform], **kinds, **DEPTH)(**given, bboxes=boxes, kinds=[1], keypoints=points)
+        assert {"image", "mask", "masks", "bboxes", "keypoints"} <= set(transform.targets)
         assert np.array_equal(out["mask"], given["mask"])
+        assert np.array_equal(out["masks"], given["masks"])
+        assert np.allclose(out["keypoints"], points)
         assert np.allclose(out["bboxes"], boxes)
         assert out["label"] == 3
 
@@ -111,5 +117,7 @@ class TestOpticsTransform(BaseTester):
     def test_exception_no_depth(self):
         with pytest.raises(ValueError, match=r"missing keys: {'depth'}"):
             A.Compose([OpticsTransform(camera())], **DEPTH)(image=arrays()["image"])
+        with pytest.raises(ValueError, match=r"missing keys: {'depth'}"):
+            A.Compose([OpticsTransform(camera(), holes="fill")], **FILLED)(image=arrays()["image"])
         with pytest.raises(ValueError, match="border 'valid' crops the image"):
             OpticsTransform(camera(border="valid"))

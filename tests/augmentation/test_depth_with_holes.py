@@ -7,10 +7,9 @@ before or after the picture is taken if it is a container.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import cycle, product
+from itertools import cycle
 from typing import Any, NamedTuple
 
-import cv2
 import kornia.augmentation as K
 import numpy as np
 import pytest
@@ -23,9 +22,8 @@ import kornia_tidy
 from kornia_tidy import DefocusRange, TiDyOptics, burst, moving_capture
 from kornia_tidy.augmentation import LinearCamera, OpticsPipeline, RandomDepthBlur, RandomTiDyOptics, bound_depth
 from kornia_tidy.data import Scene, fill_holes
-from kornia_tidy.data.pfm import decode_pfm
 from tests.augmentation.optional import need, need_torchvision
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera
 
 HEIGHT, WIDTH = 20, 28
@@ -81,25 +79,6 @@ def one_pixel() -> NDArray[np.float32]:
 
 
 MAPS = {"Kinect": kinect, "Middlebury": middlebury, "NYU": nyu, "lidar": lidar, "one pixel": one_pixel}
-FILES = {
-    "Kinect": ("data/rgbd/open3d/RGBD/depth/00000.png", 0.001),
-    "Middlebury": ("data/rgbd/middlebury2014/Motorcycle/disp0GT.pfm", None),
-    "7-Scenes": ("data/rgbd/7scenes/frame-000000.depth.png", 0.001),
-}
-
-
-def from_file(name: str) -> NDArray[np.float32]:
-    """Every so manieth pixel of a published file, in metres, its unknown pixels as they are stored."""
-    part, scale = FILES[name]
-    path = shared(part)
-    if scale is None:
-        stored = decode_pfm(path.read_bytes())
-        metres = np.where(np.isfinite(stored), 0.193 * 999.4 / (stored + 32.8), 0)
-    else:
-        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        metres = np.where(stored == 65535, 0, stored * scale)
-    steps = (metres.shape[0] // HEIGHT, metres.shape[1] // WIDTH)
-    return np.ascontiguousarray(metres[:: steps[0], :: steps[1]][:HEIGHT, :WIDTH], np.float32)
 
 
 def millimetres(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -344,20 +323,6 @@ class TestDepthWithHoles(BaseTester):
         for make, when in zip(MAPS.values(), cycle(way.moves), strict=False):
             check(way, of_kind(way, make(), kind), when)
 
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("kind", ["float", "16 bits"])
-    def test_property_every_map_flipped_and_cropped_before_and_after(self, way, kind):
-        for make, when in product(MAPS.values(), way.moves):
-            check(way, of_kind(way, make(), kind), when)
-
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("name", FILES)
-    def test_feature_published_files(self, way, name):
-        depth = from_file(name)
-        assert 0 < (depth > 0).mean() < 1
-        for when in way.moves:
-            check(way, of_kind(way, depth, "16 bits"), when)
-
     def test_exception_without_the_option_a_hole_is_refused(self, way):
         """With the line to type."""
         with pytest.raises(
@@ -445,11 +410,6 @@ class TestDepthWithHoles(BaseTester):
             assert torch.equal(one, other)
         assert (found[1][depth <= 0] == 0).all()
 
-    def test_feature_unchecked_inputs_are_filled_too(self):
-        image, depth = tensors(picture(), lidar())
-        optics = camera(masks=PLAIN.masks, sensor=None, check_inputs=False, holes="fill")
-        assert torch.equal(optics(image, depth), PLAIN(image, fill_holes(depth)[0]))
-
     def test_feature_a_setting_like_others(self):
         optics = camera(masks=PLAIN.masks, sensor=None, holes="fill")
         assert "holes of depth filled" in repr(optics)
@@ -458,10 +418,3 @@ class TestDepthWithHoles(BaseTester):
         assert optics.with_fidelity("draft").holes == "fill"
         optics.load_state_dict(PLAIN.state_dict(), take_over=True)  # a state says nothing about them
         assert optics.holes == "fill"
-
-    @pytest.mark.takes_seconds
-    @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
-    def test_dynamo(self):
-        image, depth = tensors(picture(), lidar())
-        compiled = torch.compile(OPTICS["fill"], backend="eager", fullgraph=True)
-        self.assert_close(compiled(image, depth), OPTICS["fill"](image, depth))

@@ -106,6 +106,8 @@ class TestAugmentationTransform(BaseTester):
         metres = millimetres[None] * 0.001
         transform = RandomDepthBlur(**LENS).as_transform(depth_scale=0.001)
         expected = depth_blur(image[None] / 255, metres[None], 0.6, 4.0)[0]
+        batch = transform({"image": image[None] / 255, "depth": millimetres[None, None].to(torch.int32)})["image"]
+        self.assert_close(batch, expected[None], atol=1e-6)
         if kind == "tensors":
             out = transform({"image": image, "depth": millimetres[None].to(torch.int32)})["image"] / 255
         elif kind == "tuple":

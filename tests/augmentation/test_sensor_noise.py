@@ -79,6 +79,13 @@ class TestRandomSensorNoise(BaseTester):
             source = torch.Generator().manual_seed(int(drawn["seed"][row]))
             self.assert_close(noisy[row : row + 1], sensor_noise(image[row : row + 1], *values, generator=source))
 
+    def test_feature_defaults_are_drawn_over_the_ranges_of_the_documentation(self):
+        drawn = RandomSensorNoise(p=1.0).forward_parameters((3000, 3, 8, 8))
+        for name, (low, high) in {"full_well": (1e3, 2e4), "read_noise": (1.0, 10.0)}.items():
+            assert low <= drawn[name].min() < 1.02 * low
+            assert 0.99 * high < drawn[name].max() <= high
+        assert not drawn["dark"].any()
+
     def test_exception(self):
         with pytest.raises(ValueError, match="dark must stay below full_well, got up to 600 of 500 electrons"):
             RandomSensorNoise(full_well=(500.0, 1e3), dark=(0.0, 600.0))

@@ -29,7 +29,7 @@ from tests.benchmarks.rendering_against_peers import (
     ikoma_stack,
     in_turn,
     labels_of,
-    load_scene,
+    load_aloe,
     make_bank,
 )
 from tests.render.scenes import Bank
@@ -211,7 +211,7 @@ def main() -> None:
     wanted = parser.parse_args().rows
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    image, psi = load_scene("aloe")
+    image, psi = load_aloe()
     print("| what | ours, ms | beside | ms | times ours |\n|---|---|---|---|---|")
     for name, rows in ROWS.items():
         if wanted and name not in wanted:

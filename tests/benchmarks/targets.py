@@ -28,7 +28,7 @@ from tests.benchmarks.rendering_against_peers import (
     ikoma_stack,
     in_turn,
     labels_of,
-    load_scene,
+    load_aloe,
     make_bank,
     tiled_occlusion,
 )
@@ -246,7 +246,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="*", metavar="row", choices=[*ROWS, []], help="numbers of rows (default: all)")
     wanted = parser.parse_args().rows
-    image, psi = load_scene("aloe")
+    image, psi = load_aloe()
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     print(
         f"{platform.processor() or platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}, "

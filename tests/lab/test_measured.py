@@ -8,7 +8,14 @@ import pytest
 import torch
 
 from kornia_tidy import PSFBank, SensorNoise, ThinLensCamera
-from kornia_tidy.lab.measured import closed_form_system, measured_settings, takes_psfs, with_measurements
+from kornia_tidy.lab.capture_file import CaptureLight
+from kornia_tidy.lab.measured import (
+    check_capture,
+    closed_form_system,
+    measured_settings,
+    takes_psfs,
+    with_measurements,
+)
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
@@ -122,6 +129,17 @@ class TestWithMeasurements(BaseTester):
         ):
             with pytest.raises(ValueError, match=sentence):
                 with_measurements(through(**lens), psfs)
+
+    def test_exception_captures_of_other_colours_or_without_their_noise(self, psfs, network):
+        told, by_lens = with_measurements(network, psfs), network._replace(step=0)
+        three, grey = (CaptureLight(torch.rand(c, 9, 9), lambda picture: picture, {}, SENSOR) for c in (3, 1))
+        check_capture(told, "a.png", three)
+        check_capture(by_lens, "a.png", grey)
+        with pytest.raises(ValueError, match=r"the PSFs were measured in 3 colours, and a\.png has 1"):
+            check_capture(told, "a.png", grey)
+        check_capture(told, "a.png", three._replace(noise=None))
+        with pytest.raises(ValueError, match=r"the noise of a\.png is not known: give --noise"):
+            check_capture(by_lens, "a.png", three._replace(noise=None))
 
     def test_feature_networks_that_deconvolve(self, network):
         assert takes_psfs(network.head)

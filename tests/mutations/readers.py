@@ -27,6 +27,7 @@ from kornia_tidy.lab.mask_export import read_heights, read_response, read_slm_fr
 from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
 from kornia_tidy.lab.raw.tags import camera_tags, kodak_matrix, tiff_directories
+from kornia_tidy.optics import Lens
 from kornia_tidy.reconstruction import load_midas_small
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
@@ -42,6 +43,7 @@ from tests.data.tiff_walk import cases as combinations
 from tests.data.tiff_walk import make as make_tiff
 from tests.lab.raw.dng import dng
 from tests.mutations.pristine import Case, make_cases
+from tests.optics.lens.written_files import WRITERS, doublet
 
 SHARES = {
     "checkpoint": 0.1,
@@ -208,7 +210,26 @@ def _calibrations(folder: Path) -> list[Case]:
         Case("calibration", "text", folder / "calib.txt", read_calibration),
         Case("calibration", "json", folder / "calib.json", read_calibration),
         Case("noise", "json", folder / "noise.json", lambda path: read_noise(path).sensor_noise()),
+        *_lenses(folder),
     ]
+
+
+def _lenses(folder: Path) -> list[Case]:
+    """Lenses: prescriptions of optical programs, a Zernike table, and a table of this package."""
+
+    def traced(path: Path) -> Lens:
+        return Lens.from_prescription(path, 8.0, 0.6, wavelengths=[530e-9], field=4e-3)
+
+    cases = []
+    for suffix, write in WRITERS.items():
+        path = folder / f"lens{suffix}"
+        path.write_text(write(doublet()))
+        cases.append(Case("lens", "json" if suffix.endswith("json") else "text", path, traced))
+    table, file = folder / "lens.csv", folder / "lens.safetensors"
+    table.write_text("field_mm,wavelength_nm,Z4,Z7\n0,530,0.1,0.0\n2.5,530,0.1,0.2\n5,530,0.1,0.4\n")
+    Lens.from_seidel(50e-3, 8.0, 0.6, 5e-3, coma=1.0).save(file)
+    cases.append(Case("lens", "text", table, lambda path: Lens.from_zernike_table(path, 50e-3, 8.0, 0.6)))
+    return [*cases, Case("lens", "safetensors", file, Lens.load)]
 
 
 def _folders(folder: Path, made: dict[str, list[Case]]) -> list[Case]:

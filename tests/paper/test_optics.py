@@ -11,9 +11,6 @@ import torch
 from examples.paper import burst, theorem
 from examples.paper.readme import EXPERIMENTS
 from examples.paper.runner import ABOUT, main, run
-from examples.paper.shipped import with_parts
-from examples.paper.switching_time import trials as switching_trials
-from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
 from kornia_tidy.optics.aperture import circular_aperture
 from tests.base import BaseTester
@@ -33,12 +30,6 @@ class TestEveryExperiment(BaseTester):
         assert "Judged can be" in text
         assert f"{len(rows)} of {len(rows)} trials" in text
 
-    def test_cardinality_each_trial_of_each_scale_is_another(self, name):
-        experiment = importlib.import_module(f"examples.paper.{name}").EXPERIMENT
-        for scale in ("smoke", "cpu", "gpu", "paper"):
-            trials = [tuple(trial.items()) for trial in experiment.trials(scale)]
-            assert len(set(trials)) == len(trials) > 0
-
 
 @pytest.mark.parametrize("experiment", [theorem.EXPERIMENT, burst.EXPERIMENT], ids=["theorem", "burst"])
 @pytest.mark.slow  # .ci/run runs it
@@ -54,14 +45,6 @@ def test_smoke_two_runs_print_the_same_digits(experiment, tmp_path):
 
 
 class TestTheorem(BaseTester):
-    def test_feature_a_trial_repeats_to_the_last_digit(self):
-        trial = theorem.trials("smoke")[0]
-        assert theorem.measure(trial, "smoke") == theorem.measure(trial, "smoke")
-
-    def test_feature_the_psf_holds_all_light(self):
-        psf = theorem.average_psf(theorem.target_masks("five random masks", 0), circular_aperture(theorem.SIDE))
-        assert float(psf.sum()) == pytest.approx(1.0, abs=1e-5)
-
     def test_feature_the_bound_is_below_every_residual_of_a_single_mask_and_zero_for_one(self):
         aperture = circular_aperture(theorem.SIDE)
         scores = theorem.measure({"target": "five random masks", "fitted": "1", "seed": "0"}, "smoke")
@@ -81,27 +64,3 @@ class TestTheorem(BaseTester):
         bound = float(autocorrelation_bound(pair, aperture))
         assert bound == pytest.approx(0.0, abs=1e-6)
         assert 0 < theorem.least_residual(bound, target, aperture) < residual
-
-
-class TestShipped(BaseTester):
-    def test_feature_only_the_named_part_changes(self):
-        optics = TiDyOptics(PixelwiseMask(2), fidelity="draft")
-        changed = with_parts(optics, compositing="occlusion")
-        assert changed.compositing == "occlusion"
-        assert optics.compositing == "gather"
-        assert changed.fidelity == optics.fidelity
-        self.assert_close(changed.masks.phase, optics.masks.phase)
-
-    def test_feature_a_system_of_one_mask_is_scored_once(self):
-        assert sum(trial["system"] == "joint-1" for trial in switching_trials("cpu")) == 1
-
-
-class TestBurst(BaseTester):
-    def test_feature_a_burst_loses_the_light_of_its_pauses(self):
-        light = [float(burst.measure(trial, "smoke")["light"]) for trial in burst.trials("smoke")[:2]]
-        lost = 4 * burst.PAUSE / burst.EXPOSURE
-        assert light[1] / light[0] == pytest.approx(1 - lost, abs=0.01)
-
-    def test_feature_a_shift_by_whole_pixels_rolls_the_scene(self):
-        scene = torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(0))
-        self.assert_close(burst.moved(scene, 3.0), scene.roll(3, -1), atol=1e-5, rtol=0.0)

@@ -12,9 +12,8 @@ from examples.paper.cameras import camera_with
 from examples.paper.scenes import BUDGETS
 from examples.paper.sequence_length import first_masks
 from examples.paper.shipped import load_shipped
-from examples.paper.training import fit, head_settings, mean_scores
-from kornia_tidy import DwellTimes, Switching
-from kornia_tidy.reconstruction.trained import build_head
+from examples.paper.training import mean_scores
+from kornia_tidy import Switching
 from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
@@ -44,11 +43,6 @@ class TestTrials(BaseTester):
             seen.append(states)
         assert optics.modulator.switching_time == 4e-3
 
-    def test_feature_a_modulator_without_swaps_stays(self):
-        optics = camera_with(first_masks(3, "edof", 0), BUDGETS["smoke"].fidelity, modulator=DwellTimes())
-        switching_training.other_patterns(optics, 0)
-        assert isinstance(optics.modulator, DwellTimes)
-
 
 class TestCrossedScores(BaseTester):
     @pytest.mark.slow  # .ci/run runs it
@@ -64,19 +58,3 @@ class TestCrossedScores(BaseTester):
         further = trained_further.crossed_scores({**trial, "trained": "occlusion"}, "smoke", GATHER, ["gather"])
         assert further["network_gather_painted_psnr"] != direct["psnr"]
         assert further["closed_gather_painted_psnr"] != shipped["closed_gather_painted_psnr"]  # its masks moved
-
-    def test_feature_a_function_is_called_before_each_step(self):
-        budget, called = BUDGETS["smoke"], []
-        optics, settings = camera_with(first_masks(2, "edof", 0), budget.fidelity), head_settings("edof", budget)
-        fit(optics, build_head(settings), settings, budget, 0, called.append)
-        assert called == list(range(budget.steps))
-
-    def test_feature_rows_of_a_system_are_means_over_its_seeds(self):
-        score = "network_gather_painted_psnr"
-        rows = [
-            {"system": "a", "trained": "gather", "seed": str(seed), "task": "edof", score: value}
-            for seed, value in enumerate(("20", "22"))
-        ]
-        rows.append({"system": "a", "trained": "occlusion", "seed": "0", "task": "edof", score: "25"})
-        table = trained_further.crossed_table(rows, ["gather"], "network").splitlines()
-        assert table[2:] == ["| a | gather | 2 | 21.00 ± 1.00 |", "| a | occlusion | 1 | 25.00 |"]

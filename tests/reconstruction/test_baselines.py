@@ -20,10 +20,7 @@ from kornia_tidy.reconstruction.baselines import (
     working_size,
 )
 from kornia_tidy.reconstruction.heads import make_head
-from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
-from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
-from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics
 from tests.base import BaseTester
 
 KINDS = {"depth-anything-v2": ("DepthAnythingForDepthEstimation", load_depth_anything_v2, 14, (0.485, 0.456, 0.406))}
@@ -197,40 +194,3 @@ class TestFormatOfTransformers(BaseTester):
             found = head(image)
         assert depth.std() > 1e-3 * depth.abs().mean()
         self.assert_close(found, 1 / depth.clamp(min=1e-3) if name == "zoedepth" else depth)
-
-    def test_feature_a_metric_depth_anything_is_recognised(self, tmp_path):
-        network = tiny("depth-anything-v2").network
-        network.config.depth_estimation_type = "metric"
-        network.save_pretrained(tmp_path)
-        assert load_depth_anything_v2(tmp_path).metric
-
-    def test_exception_missing_weights_and_pickles(self, name, tmp_path):
-        load, network = KINDS[name][1], tiny(name).network
-        weights = network.state_dict()
-        first = next(key for key in weights if key.startswith("neck"))
-        network.save_pretrained(tmp_path, state_dict={key: value for key, value in weights.items() if key != first})
-        with pytest.raises(ValueError, match=f"1 weights are missing, first {first}"):
-            load(tmp_path)
-        (tmp_path / "model.safetensors").unlink()
-        torch.save(weights, tmp_path / "pytorch_model.bin")
-        with pytest.raises(OSError, match="safetensors"):
-            load(tmp_path)
-
-    def test_feature_a_system_with_it_is_saved_and_loaded(self, name, tmp_path):
-        settings = SystemSettings(
-            task="depth", masks=0, window=9, fidelity="draft", head=name, width=16, depth_range=(0.5, 2.0)
-        )
-        head = build_head(settings).eval()
-        with torch.no_grad():
-            head.scale.fill_(0.25)
-        save_pretrained(TrainedSystem(build_optics(settings).eval(), head, settings, 0), tmp_path)
-        again = from_pretrained(tmp_path).head
-        for key, value in head.state_dict().items():
-            assert torch.equal(again.state_dict()[key], value)
-
-    def test_smoke_gradients_reach_picture_and_network(self, name):
-        head = tiny(name)
-        image = torch.rand(1, 3, 40, 50, requires_grad=True)
-        head(image).square().sum().backward()
-        assert bool(image.grad.abs().sum() > 0)
-        assert any(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in head.network.parameters())

@@ -61,20 +61,6 @@ def bilateral(image, window=7, color=0.2, space=2.0):
 
 
 class TestClosedForm(BaseTester):
-    @pytest.mark.parametrize("inverse", ["tikhonov", "wiener"])
-    @pytest.mark.parametrize("layers", [0, 4])
-    def test_smoke(self, layers, inverse, device, dtype):
-        restore = ClosedForm(layers, inverse=inverse).to(device, dtype)
-        restore.set_psfs(bank(layers or NODES, dtype=torch.float32))
-        restored = restore.to(device)(photo(12, 17, dtype=dtype).to(device))
-        assert restored.image.dtype == restored.maps.dtype == dtype
-        assert restored.image.shape == (2, 3, 12, 17)
-        assert restored.maps.shape == (2, closed_form_channels(layers), 12, 17)
-
-    def test_cardinality_small_images(self):
-        for size in [(1, 1), (3, 40), (4, 4)]:
-            assert closed_form()(photo(*size), 0.01).image.shape == (2, 3, *size)
-
     @pytest.mark.parametrize("encoded", [True, False])
     def test_feature_maps_are_capture_deconvolutions_image_and_noise(self, encoded):
         restore, capture = closed_form(encoded=encoded, bilateral=False), photo(20, 24)
@@ -175,15 +161,6 @@ class TestClosedForm(BaseTester):
         self.assert_close(restore.noise_map(capture), expected, rtol=1e-6)
         self.assert_close(restore(capture).image, restore(capture, expected).image)
 
-    def test_feature_a_point_is_restored_to_a_sharper_one(self):
-        """Of a scene blurred by the mean PSF, in linear light."""
-        scene = torch.full((1, 3, 32, 32), 0.2, dtype=torch.float64)
-        scene[..., 16, 16:18] = 0.9
-        capture = linear_rgb_to_rgb(convolve_kernels(scene, bank().psfs.mean(0, keepdim=True))[:, 0])
-        sharp = linear_rgb_to_rgb(scene)
-        error = (closed_form()(capture, 0.002).image - sharp).square().mean()
-        assert error < 0.5 * (capture - sharp).square().mean()
-
     def test_feature_flipped_psfs_for_correlations(self):
         straight, flipped = closed_form(), ClosedForm().double()
         turned = bank()
@@ -232,7 +209,12 @@ class TestClosedForm(BaseTester):
     @pytest.mark.parametrize("inverse", ["tikhonov", "wiener"])
     def test_gradcheck(self, inverse, device):
         restore = closed_form(inverse=inverse).to(device)
-        self.gradcheck(lambda capture: restore(capture, 0.01).maps, (photo(8, 8)[:1].to(device),))
+
+        def restored(capture):
+            found = restore(capture, 0.01)
+            return found.maps, found.image
+
+        self.gradcheck(restored, (photo(8, 8)[:1].to(device),))
 
     @pytest.mark.takes_seconds
     def test_dynamo(self, device):

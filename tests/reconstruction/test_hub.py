@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
-from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_record
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics
 from tests.base import BaseTester
@@ -100,10 +99,6 @@ class TestSavePretrained(BaseTester):
         with pytest.raises(ValueError, match="it is not a folder"):
             save_pretrained(system, tmp_path / "a")
 
-    def test_feature_a_shipped_system(self, tmp_path):
-        save_pretrained(load_pretrained(PRETRAINED[0]), tmp_path, record=pretrained_record(PRETRAINED[0]))
-        assert from_pretrained(tmp_path).record["scores"] == pretrained_record(PRETRAINED[0])["scores"]
-
 
 class TestFromPretrained(BaseTester):
     @pytest.fixture
@@ -170,18 +165,3 @@ class TestFromPretrained(BaseTester):
         monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
         assert from_pretrained("ada/system", revision="v1").step == 12
         assert asked == [("ada/system", "config.json", "v1"), ("ada/system", "model.safetensors", "v1")]
-
-    def test_feature_huggingface_hub_finds_a_repository_in_its_cache(self, folder, tmp_path):
-        """The layout of its cache: refs/main names a commit, snapshots/COMMIT has the files."""
-        pytest.importorskip(
-            "huggingface_hub", reason="huggingface_hub is not installed: pip install 'kornia-tidy[hub]'"
-        )
-        repository, commit = tmp_path / "cache" / "models--ada--system", "0" * 40
-        (repository / "refs").mkdir(parents=True)
-        (repository / "refs" / "main").write_text(commit)
-        (repository / "snapshots").mkdir()
-        folder.rename(repository / "snapshots" / commit)
-        found = from_pretrained("ada/system", cache_dir=tmp_path / "cache", local_files_only=True)
-        assert found.settings == SETTINGS
-        with pytest.raises(OSError, match=r"cannot download config\.json of the repository ada/other: "):
-            from_pretrained("ada/other", cache_dir=tmp_path / "cache", local_files_only=True)

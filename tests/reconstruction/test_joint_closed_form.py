@@ -165,18 +165,6 @@ class TestJointClosedFormHead(BaseTester):
         self.assert_close(smoothed_classes(*in_training.split([CLASSES, 3], 1)), before[:, :CLASSES])
         assert "temperature" in head.state_dict()
 
-    @pytest.mark.parametrize("refined", [False, True])
-    def test_feature_learns_image_and_depth_from_zero(self, refined):
-        head = joint(refined=refined).train()
-        optimizer = torch.optim.Adam(head.parameters(), 1e-3)
-        capture = photo(32, 32, dtype=torch.float32)
-        for _ in range(3):
-            optimizer.zero_grad()
-            output = head(capture, 0.01)
-            ((output[:, -3:] - capture.flip(1)).square().mean() + output[:, 0].mean()).backward()
-            optimizer.step()
-        assert all(parameter.grad.any() for parameter in head.parameters())
-
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("kind", "refined"), [(NAFNet, False), (PlainHead, False), (PlainHead, True)])
     def test_feature_tiles_are_the_whole(self, kind, refined):

@@ -9,18 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.color import linear_rgb_to_rgb
 from torch import nn
 
 import kornia_tidy
 from kornia_tidy import SensorNoise, ThinLensCamera
-from kornia_tidy.data import DeadLeaves, PhotographicLeaves, dead_leaves
-from kornia_tidy.reconstruction import receptive_field
+from kornia_tidy.data import dead_leaves
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import LightHead, UncertainReconstruction, reconstruct_light, with_noise_of
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.tasks import channels_of
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, update_psfs
@@ -95,13 +93,6 @@ class TestLightHead(BaseTester):
 
 
 class TestReconstructLight(BaseTester):
-    def test_feature_each_task_gives_its_maps(self):
-        light = torch.rand(3, 40, 30)
-        for task, expected in (("edof", (True, False)), ("depth", (False, True)), ("joint", (True, True))):
-            result = reconstruct_light(light_head(task), light)
-            assert (result.image is not None, result.depth is not None) == expected
-        self.assert_close(result.image, linear_rgb_to_rgb(light))
-
     @pytest.mark.parametrize("head", CLOSED_FORMS[::2])
     @torch.no_grad()
     def test_feature_behind_a_lens_the_psfs_of_the_place_restore_better_than_those_of_the_axis(self, head):
@@ -148,67 +139,6 @@ class TestReconstructLight(BaseTester):
         self.assert_close(found.image, whole, atol=12.92 * 5 * 10 * 2**-24, rtol=0)
         dark = head(optics.encode(light[None, ..., :60]))[0]
         assert (dark - whole[..., :60])[..., :30].abs().max() > 0.01
-
-    def test_feature_no_graph_is_kept(self):
-        """Of the check that tiles equal the whole it would take gigabytes."""
-        settings = SystemSettings(task="edof", masks=1, window=9, head="plain", width=2)
-        optics, head, seen, tiles = build_optics(settings), build_head(settings), [], []
-        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
-        head.register_forward_pre_hook(lambda *_: seen.append(torch.is_grad_enabled()))  # copies have it, too
-        light = torch.rand(3, 40, 300)
-        reconstruct_light(light_head, light, memory_budget=1 << 19, progress=lambda *counts: tiles.append(counts))
-        assert len(tiles) > 1
-        assert len(seen) > len(tiles)
-        assert not any(seen)
-
-    def test_feature_an_overlap_below_the_receptive_field_is_not_exact(self):
-        settings = SystemSettings(task="edof", masks=1, window=9, head="nafnet", width=2)
-        optics, head = build_optics(settings), build_head(settings)
-        for parameter in head.parameters():
-            torch.nn.init.normal_(parameter, std=0.1, generator=torch.Generator().manual_seed(1))
-        light_head = LightHead(TrainedSystem(optics, head, settings, 0))
-        reach, light = receptive_field(light_head), torch.rand(3, 40, 900)
-
-        def image(overlap, budget):
-            seen = []
-            options = {"memory_budget": budget, "progress": lambda *counts: seen.append(counts)}
-            return reconstruct_light(light_head, light, overlap=overlap, **options).image, len(seen)
-
-        whole, count = image(None, 1 << 30)
-        assert count == 1
-        small = 4 << 20
-        (exact, many), (also, _), (near, few) = image(None, small), image(reach, small), image(16, small)
-        assert min(many, few) > 1
-        assert torch.equal(also, exact)
-        self.assert_close(exact, whole)
-        assert not torch.allclose(near, whole, atol=1e-6)
-        self.assert_close(near[..., :16], whole[..., :16])
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize(("name", "orientations"), [("edof-5", 1), ("joint-uncertain", 1), ("edof-5", 8)])
-    def test_feature_tiles_of_shipped_networks_are_near_the_whole(self, name, orientations):
-        system = load_pretrained(name)
-        head, (image, depth, _) = LightHead(system, orientations=orientations), DeadLeaves(1, 900, 600, seed=1).read(0)
-        with torch.no_grad():
-            capture = rgb_to_linear_rgb(system.optics(image[None], depth[None]))[0]
-        seen = []
-        found = reconstruct_light(head, capture, progress=lambda *counts: seen.append(counts))
-        whole = reconstruct_light(head, capture, memory_budget=4 << 30)
-        assert len(seen) > 1
-        assert (found.image - whole.image).abs().max() < 1e-3
-
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("name", ["edof-5", "edof-designed"])
-    def test_feature_shipped_systems_are_better_in_eight_orientations(self, name):
-        system = load_pretrained(name)
-        image, depth, _ = PhotographicLeaves(1, 128, 192, seed=4).read(0)
-        with torch.no_grad():
-            light = rgb_to_linear_rgb(system.optics(image[None], depth[None]))[0]
-            errors = [
-                (reconstruct_light(LightHead(system, orientations=count), light).image - image).square().mean()
-                for count in (1, 8)
-            ]
-        assert errors[1] < errors[0]
 
     def test_feature_pictures_at_the_same_time_have_copies_with_their_own_noise_and_stray_light(self, monkeypatch):
         settings = SystemSettings(masks=1, window=9, stray_light="veil", head="tikhonov-bilateral")

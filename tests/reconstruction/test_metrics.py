@@ -81,12 +81,6 @@ class TestMetrics(BaseTester):
         self.assert_close(value.double().cpu(), torch.tensor(expected, dtype=torch.float64))
         assert value.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
 
-    def test_feature_without_a_mask_all_pixels_count(self, metric, device, dtype):
-        prediction, target, _ = make_depths(device=device, dtype=dtype)
-        target = target.nan_to_num(1.0)
-        everywhere = torch.ones(1, 1, 1, 1, dtype=torch.bool, device=device)
-        assert torch.equal(metric(prediction, target), metric(prediction, target, everywhere))
-
     def test_feature_an_image_without_a_valid_pixel_scores_nan_and_the_others_do_not(self, metric, device, dtype):
         prediction, target, mask = make_depths(device=device, dtype=dtype)
         whole = metric(prediction, target, mask)
@@ -165,11 +159,6 @@ class TestChroma(BaseTester):
             errors = np.concatenate([0.564 * (blue - luma), 0.713 * (red - luma)])
             expected.append(-10 * math.log10(np.mean(errors**2)))
         self.assert_close(chroma_psnr(prediction, target, mask).double().cpu(), torch.tensor(expected).double())
-
-    def test_feature_brightness_does_not_count(self, device):
-        image = torch.rand(1, 3, 8, 8, device=device, dtype=torch.float64)
-        assert chroma_psnr(image, image + 0.1 * torch.rand(1, 1, 8, 8, device=device)).item() > 200
-        assert chroma_psnr(image, image + torch.tensor([0.1, 0.0, 0.0], device=device).view(1, 3, 1, 1)).item() < 30
 
     def test_feature_masked_pixels_have_exactly_no_gradient(self, device):
         prediction, target, mask = make_depths((1, 3, 24, 27), device)

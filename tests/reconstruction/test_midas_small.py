@@ -44,13 +44,6 @@ class TestMiDaSSmall(BaseTester):
             state = MiDaSSmall().state_dict()
         assert [[name, list(value.shape)] for name, value in state.items()] == published
 
-    def test_feature_the_published_number_of_parameters(self):
-        with torch.device("meta"):
-            head = MiDaSSmall()
-        assert len(head.state_dict()) == 482
-        assert sum(p.numel() for p in head.parameters()) == 21_320_545
-        assert sum(p.numel() for p in head.parameters() if not p.requires_grad) == 4_719_616
-
     def test_feature_outputs_are_those_of_the_published_network(self, published):
         """Literals: the network of isl-org/MiDaS at 4545977 with the same weights and normalised input, float64."""
         head = MiDaSSmall().eval()
@@ -78,13 +71,6 @@ class TestMiDaSSmall(BaseTester):
         head(colours[..., None, None].expand(2, 3, 32, 32))
         expected = torch.tensor([0.0, 1.0], device=device, dtype=dtype).view(2, 1, 1, 1).expand(2, 3, 32, 32)
         self.assert_close(seen[0], expected, atol=1e-6)
-
-    def test_feature_outputs_start_alive(self):
-        """A rectified output below zero everywhere would never learn."""
-        for _ in range(2):
-            out = MiDaSSmall()(torch.rand(2, 3, 64, 64))
-            assert (out > 0).double().mean() > 0.98
-            assert out.std() > 0.01
 
 
 class TestLoadMiDaSSmall(BaseTester):

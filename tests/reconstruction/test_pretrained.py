@@ -51,7 +51,7 @@ class TestPretrained(BaseTester):
         def note(result):
             captures.append(-10 * (result.coded - result.truth["image"]).square().mean().log10())
 
-        scenes = DeadLeaves(4, 128, 128, depth_range=system.optics.camera.depth_range, seed=31)
+        scenes = DeadLeaves(2, 128, 128, depth_range=system.optics.camera.depth_range, seed=31)
         scores = mean_row(evaluate(system, scenes, each=note))
         told = about_pretrained()["systems"][name]["scores"]["dead leaves"]
         gain = told["image_psnr"] - told["capture_psnr"]

@@ -108,12 +108,20 @@ class TestRuledClosedForm(BaseTester):
         apart = torch.stack([convolve_kernels(each, restore.places) - scene[:, None] for each in seen])
         left = convolve_kernels(drawn, restore.places)
 
+        def product(first, second):
+            """Of two kernels' errors."""
+            scenes, drawn = (
+                (apart[:, :, first] * apart[:, :, second]).mean((1, 2, 3, 4)),
+                left[:, first] * left[:, second],
+            )
+            return float(shares @ scenes + BEFORE_BILATERAL * drawn.mean())
+
+        pairs = [(product(k, k), product(k, k + 1), product(k + 1, k + 1)) for k in range(FILTERS - 1)]
+
         def error(place):
             low = min(int(place), FILTERS - 2)
-            rest = place - low
-            one = (1 - rest) * apart[:, :, low] + rest * apart[:, :, low + 1]
-            other = (1 - rest) * left[:, low] + rest * left[:, low + 1]
-            return float(shares @ one.square().mean((1, 2, 3, 4)) + BEFORE_BILATERAL * other.square().mean())
+            rest, (one, both, other) = place - low, pairs[low]
+            return (1 - rest) ** 2 * one + 2 * rest * (1 - rest) * both + rest**2 * other
 
         chosen = place(restore, (seen + drawn).flatten(0, 1), noise)
         errors = [error(i / STEPS) for i in range((FILTERS - 1) * STEPS + 1)]

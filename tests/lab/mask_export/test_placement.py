@@ -29,6 +29,8 @@ class TestPanelPlacement(BaseTester):
             ({"panel_pitch": -1.0}, "panel_pitch must be positive and finite metres"),
             ({"pupil_radius": math.nan}, "pupil_radius must be positive and finite metres"),
             ({"offset": (0.5, 0)}, r"offset must be whole panel pixels \(right, down\), got \(0.5, 0\)"),
+            ({"offset": (1, 2, 3)}, r"offset must be whole panel pixels \(right, down\), got \(1, 2, 3\)"),
+            ({"panel": (5, 5, 5)}, r"panel must be \(rows, columns\), both positive whole numbers, got \(5, 5, 5\)"),
             ({"flip": "diagonal"}, "flip must be one of 'none', 'left-right', 'up-down', got 'diagonal'"),
             ({"rotate": 45}, "rotate must be one of 0, 90, 180, 270, got 45"),
         ],

@@ -83,8 +83,7 @@ class TestCameraTags(BaseTester):
             below = b"".join(struct.pack("<HHII", tag, LONG, number, places) for tag in (0x014A, 0x8769))
             data += struct.pack("<H", 2) + below + struct.pack("<I", 8 + 30 * last if last < many else 0)
         data += struct.pack(f"<{number}I", *[8] * number)
-        for _ in range(30):
-            assert len(list(tiff_directories(data))) == many
+        assert len(list(tiff_directories(data))) == many
 
     def test_feature_only_what_is_looked_for_is_kept(self):
         """512 tags of 64 KiB each, all of them the same bytes: a tuple of half a megabyte each in memory."""

@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from kornia_tidy import PixelwiseMask, PSFBank, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointImage, diffraction_cutoff, measure_psfs, point_images
+from kornia_tidy.lab.calibration.psf import (
+    MeasuredPSFs,
+    PointImage,
+    diffraction_cutoff,
+    measure_psfs,
+    measured_psfs,
+    point_images,
+)
 from kornia_tidy.masks import fisher_mask
 from kornia_tidy.render import render
 from tests.base import BaseTester
@@ -94,6 +101,19 @@ class TestMeasurePSFs(BaseTester):
         expected = 0.798 * measured.uncertainty.sum((2, 3))
         assert bool(((measured.bank.psfs - truth).abs().sum((2, 3)) < 1.6 * expected).all())
         assert bool(((measured.bank.psfs - truth).abs().sum((2, 3)) > 0.4 * expected).all())
+
+    def test_feature_errors_follow_from_those_of_the_light_and_of_its_sum(self, images, monkeypatch):
+        """By the derivatives of x_i / (x_1 + ... + x_n) at a sum of one: d_ij - p_i."""
+        raws, own = [], measured_psfs._raw
+        monkeypatch.setattr(measured_psfs, "_raw", lambda *given: raws.append(own(*given)) or raws[-1])
+        monkeypatch.setattr(measured_psfs, "shrink", lambda psf, variance: (psf, variance))
+        found = measure_psfs({0.8: images[0.8]}, CAMERA, WINDOW, CUTOFF)
+        (raw,) = raws
+        for channel, psf in enumerate(raw.psf.flatten(1)):
+            slopes = torch.eye(len(psf), dtype=psf.dtype) - psf[:, None]
+            light, together = raw.variance[channel].flatten(), raw.common[channel].flatten(1)
+            expected = slopes.square() @ light + (slopes @ together.mT).square().sum(1)
+            self.assert_close(found.uncertainty[0, channel].flatten(), expected.sqrt().float(), rtol=1e-4, atol=1e-9)
 
     @pytest.mark.parametrize("gradient", [3e-5, 1e-3])
     def test_feature_a_gradient_of_the_background_is_taken_off(self, coded, flat, truth, gradient):
