@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-
 from tests.base import BaseTester
 from tests.code_mutants.mutants import KINDS, mutants_of
-
 
 PYTHON = b'''
 class Bank:

@@ -115,11 +115,15 @@ def read_zernike_table(
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if a value is missing or no number.
+        ValueError: if the file is no CSV file, or a value is missing or no number.
     """
     check_choice("order", order, ORDERS)
     check_choice("sign", sign, (-1, 1))
-    rows = [row for row in csv.reader(read_text(path).splitlines()) if row and not row[0].startswith("#")]
+    text = read_text(path)
+    try:
+        rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith("#")]
+    except csv.Error as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
     if len(rows) < 2:
         raise ValueError(f"{path} must have a line of names and one or more of numbers, got {len(rows)} lines")
     names = [name.strip() for name in rows[0]]

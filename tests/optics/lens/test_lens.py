@@ -249,6 +249,7 @@ class TestLens(BaseTester):
             ("field_mm,Z99\n1,1\n", "must be field_mm, wavelength_nm and Z1 to Z91, got 'Z99'"),
             ("field_mm\n1\n", "must have columns of coefficients such as Z4, got field_mm"),
             ("field_mm,Z4\n1\n", "line 2 of .* must have 2 values, got 1"),
+            (f"field_mm,Z4\n1,{'9' * 200_000}\n", "cannot read .*: field larger than field limit"),
             ("field_mm,Z4\n1,blue\n", "Z4 in line 2 of .* must be a finite number, got 'blue'"),
             ("field_mm,Z4\n1,1\n1,2\n", "must have each field once for each wavelength"),
             ("field_mm,Z8\n1,1\n", "must be 0, as of a lens of revolution with fields along .y, got 1 for Z8"),
