@@ -79,8 +79,9 @@ class TiDyOptics(CameraState):
             one channel are taken at 530 nm. With a basis, as ``camera_spectrum(reflectance=True)`` gives, each colour
             has a reflectance spectrum, and red things have other PSFs than blue ones.
         aperture: amplitude over the mask's pixels (N, N), or finer by a whole factor. Default: the pixels with centres
-            in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`. An ``nn.Parameter``, (N, N) or,
-            without a lens, one for each mask (K, N, N), is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
+            in the disc; the smooth disc for :class:`~kornia_tidy.masks.no_mask.NoMask`. (K, N, N): one for each mask,
+            where the modulator shows them one by one. An ``nn.Parameter`` is learnt: see
+            :class:`~kornia_tidy.psf.LearnableAperture`.
         check_inputs: look at the values of images and depths before any work, eagerly. Inputs in another unit (depth in
             millimetres, images in 0..255 or normalised) give one warning with the remedy.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go

@@ -126,11 +126,11 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
         A copy in float64 on the same device; of an :class:`OpenArea` another one.
 
     Shape:
-        (size, size)
+        (size, size), or (K, size, size) for K masks
 
     Raises:
         TypeError: if the values are complex.
-        ValueError: if the shape differs, a value is outside [0, 1] or NaN, or all are zero.
+        ValueError: if the shape differs, a value is outside [0, 1] or NaN, or all are zero, those of a mask too.
 
     Example:
         >>> check_aperture([[True, False], [True, True]], 2)
@@ -140,8 +140,12 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
     aperture = torch.as_tensor(unmasked("aperture", aperture))
     if aperture.is_complex():
         raise TypeError(f"aperture must be a real amplitude (its phase belongs to the mask), got {aperture.dtype}")
-    if tuple(aperture.shape) != (size, size):
-        raise ValueError(f"aperture must have shape ({size}, {size}), got {tuple(aperture.shape)}")
+    each = aperture.ndim == 3 and len(aperture) and not isinstance(aperture, OpenArea)
+    if tuple(aperture.shape[1:] if each else aperture.shape) != (size, size):
+        raise ValueError(
+            f"aperture must have shape ({size}, {size}), or (K, {size}, {size}) with amplitudes for K masks, got "
+            f"{tuple(aperture.shape)}"
+        )
     amplitude = aperture.to(torch.float64, copy=True)  # later edits of the user's array change nothing
     valid = (amplitude >= 0) & (amplitude <= 1)  # False for NaN too
     if not bool(valid.all()):
@@ -159,7 +163,7 @@ def _check_grid(size: int, pitch: float, edges: str) -> None:
 def _made(amplitude: Tensor, edges: str) -> Tensor:
     """Return the aperture, or raise if every cell is closed: such a pupil has no point spread function."""
     check_values("aperture", amplitude)
-    if not bool((amplitude > 0).any()):
+    if not bool((amplitude > 0).flatten(-2).any(-1).all()):
         raise ValueError("aperture must let some light through, got 0 open cells")
     return amplitude.as_subclass(OpenArea) if edges == "area" else amplitude
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
@@ -240,6 +240,18 @@ def field_light(
         areas = lens_light(spans, pupil.transmission, turned)
         found.append(areas[1:] / areas[0])
     return torch.stack(found, -1) @ areas.new_tensor(spectrum.channel_weights).T
+
+
+def light_on_axis(pupil: Pupil, amplitude: Tensor, lens: Lens) -> Tensor:
+    """Return the light in focus that passes a lens's stop on the axis through each mask's amplitude, (K,) float64.
+
+    Args:
+        pupil: with the cells of the amplitudes.
+        amplitude: (K, n, n).
+        lens: in front of the sensor.
+    """
+    spans, axis = whole_cells(pupil), turned_lenses(lens, [(0.0, 0.0)], [0.0], REFERENCE_WAVELENGTH)
+    return torch.stack([lens_light(spans, own.double().cpu().square(), axis)[0, 0] for own in amplitude])
 
 
 def _mixing(spectrum: Spectrum, wave: int, like: Tensor) -> tuple[list[int], Tensor]:

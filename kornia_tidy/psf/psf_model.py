@@ -32,7 +32,7 @@ from kornia_tidy.psf.defocus_interpolation import (
 )
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.field import Field, check_center
-from kornia_tidy.psf.field_bank import FieldBank, check_field, field_light, field_psf_bank
+from kornia_tidy.psf.field_bank import FieldBank, check_field, field_light, field_psf_bank, light_on_axis
 from kornia_tidy.psf.field_nodes import field_nodes
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
@@ -78,9 +78,8 @@ class PSFModel:
         fidelity: a preset's name or a :class:`~kornia_tidy.fidelity.Fidelity`.
         spectrum: wavelengths and how each channel weights them. Default: 610, 530 and 470 nm, one a channel.
         aperture: amplitude over the mask's pixels (N, N), with N the shorter side, or finer by a whole factor.
-            Default: the pixels with centres in the disc; the smooth disc for ``NoMask``. An ``nn.Parameter``,
-            (N, N) or, without a lens, one for each mask (K, N, N), is learnt: see
-            :class:`~kornia_tidy.psf.LearnableAperture`.
+            Default: the pixels with centres in the disc; the smooth disc for ``NoMask``. (K, N, N): one for each mask.
+            An ``nn.Parameter`` is learnt: see :class:`~kornia_tidy.psf.LearnableAperture`.
         lens: a :class:`~kornia_tidy.optics.Lens` with the masks in its stop, or the name of one, made for the
             camera's aperture and focus. Its stop and its rims cut the masks exactly, besides ``aperture``. Default: an
             ideal lens.
@@ -151,7 +150,7 @@ class PSFModel:
 
         Raises:
             TypeError: if a part is of another type.
-            ValueError: if the lens is not that of the camera, or a learnable aperture behind it is one for each mask.
+            ValueError: if the lens is not that of the camera.
 
         Example:
             >>> model = PSFModel(fidelity="draft").replace(masks=PixelwiseMask(1, initial="flat"))
@@ -176,12 +175,6 @@ class PSFModel:
         if present["lens"] is not None:
             given = (present[name] for name in ("lens", "camera", "fidelity", "_sampled"))
             parts["lens"] = fitting_lens(*given)
-            learnt = present["aperture"]
-            if isinstance(learnt, LearnableAperture) and learnt.amplitude.ndim == 3:
-                raise ValueError(
-                    f"a learnable aperture behind a real lens must be one (N, N) for all masks, got "
-                    f"{tuple(learnt.amplitude.shape)}"
-                )
         return self._replace(_derived=CachedParts(), **parts)
 
     def _replace(self, **fields: Any) -> Self:
@@ -384,7 +377,7 @@ class PSFModel:
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        amplitude = self.pupil.amplitude if isinstance(self.aperture, LearnableAperture) else None
+        amplitude = None if self._amplitude is None else self.pupil.amplitude
         learning = learning or (amplitude is not None and torch.is_grad_enabled() and amplitude.requires_grad)
         exact = partial(self._exact_psfs, spectrum, grid, points=AXIS if field is None else field.points)
         build = partial(exact, states, weights, window=side, each_state=each_state)
@@ -441,13 +434,13 @@ class PSFModel:
         dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
         shift = [self.camera.chromatic_defocus(wavelength) for wavelength in spectrum.wavelengths]
         if self.lens is not None:
-            shown = zip(states[:, None], torch.ones_like(weights), strict=True) if each_state else [(states, weights)]
-            banks = [
-                self._lens_psfs(
-                    spectrum, own, share.reshape(-1), nodes, window, points, tolerance or self.fidelity.pixel_tolerance
-                )
-                for own, share in shown
-            ]
+            rest = nodes, window, points, tolerance or self.fidelity.pixel_tolerance
+            if each_state:
+                one = torch.ones_like(weights[:1])
+                shown = enumerate(states[:, None])
+                banks = [self.of_state(k)._lens_psfs(spectrum, own, one, *rest) for k, own in shown]
+            else:
+                banks = [self._lens_psfs(spectrum, states, weights, *rest)]
             basis = len(spectrum.basis or (1,))  # with planes that have the light of their channel
             light = banks[0].light.unflatten(2, (-1, basis)).sum(3).repeat_interleave(basis, 2)
             light = torch.where(light == 0, 1, light)[..., None, None]
@@ -463,7 +456,7 @@ class PSFModel:
         tolerance = self.fidelity.pixel_tolerance if tolerance is None else tolerance
         step = self.pixel_step * grid
         light = states, weights, pupil, spectrum, dispersion, nodes
-        plain = isinstance(self.aperture, LearnableAperture) or each_state  # compiled as plain operations
+        plain = self._amplitude is not None or each_state  # compiled as plain operations
         if torch_mode() == Mode.GRAPH and not (plain or isinstance(step, Tensor)):
             return operator_psf_bank(*light, step, window, tolerance, shift)
         return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._remembers)
@@ -479,14 +472,15 @@ class PSFModel:
     def states(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
         """Return the phase of each state over the pupil, (S, N, N) radians, and its share of the exposure, (S,).
 
-        Where each mask has its own amplitude the share is that of the light.
+        Where each mask has its own amplitude the share is that of the light; behind a real lens, which cuts that light,
+        it is that of the time.
         """
         shown = timeline_of(self.modulator, self.masks.phase.to(dtype))
         if self.moment is not None:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
-            if isinstance(self.aperture, LearnableAperture):
+            if self._amplitude is not None and self.lens is None:
                 weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
@@ -502,20 +496,22 @@ class PSFModel:
         Raises:
             ValueError: if each mask has its own amplitude, and the modulator shows other states than the masks.
         """
-        shown = self.timeline(dtype)
-        if not isinstance(self.aperture, LearnableAperture) or self.aperture.amplitude.ndim == 2:
+        shown, amplitude = self.timeline(dtype), self._amplitude
+        if amplitude is None or amplitude.ndim == 2:
             return torch.ones_like(shown.durations)
-        light = self.aperture().square().sum((-2, -1)).to(shown.durations)
-        if shown.mixture is not None or len(shown.states) != len(light):
-            raise ValueError(
-                f"an aperture for each mask needs a modulator that shows the {len(light)} masks one by one, such as "
-                f"DwellTimes(), got {len(shown.states)} states: give one aperture (N, N) for all"
-            )
+        if self.lens is None:
+            light = amplitude.square().sum((-2, -1))
+        else:
+            light = light_on_axis(self.pupil, amplitude, self.lens)
+        light = light.to(shown.durations)
         return light / (shown.durations * light).sum()
 
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
-        return self.states(dtype)[1]
+        weights = self.states(dtype)[1]
+        if self.lens is None or self._amplitude is None or self.state is not None or self.moment is not None:
+            return weights
+        return weights * self.relative_light(dtype)
 
     # ------------------------------------------------------------------ other models of the same parts
 
@@ -703,17 +699,38 @@ class PSFModel:
         fill_factor, pupil = getattr(self.modulator, "fill_factor", 1.0), self._derived.pupil
         if pupil is None or pupil.fill_factor != fill_factor:
             aperture = getattr(self.masks, "iris", None) if self.aperture is None else self.aperture
-            if isinstance(aperture, LearnableAperture):  # any pixel may open
-                aperture = torch.ones(aperture.amplitude.shape[-2:])
+            if (amplitude := self._amplitude) is not None:  # any pixel may open
+                aperture = torch.ones(amplitude.shape[-2:])
             elif self.lens is not None and self.aperture is None:  # its stop is the edge
                 aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
-        if not isinstance(self.aperture, LearnableAperture):
+        if (amplitude := self._amplitude) is None:
             return pupil
-        if self.lens is not None:
-            return pupil.cut_by_a_lens(self.aperture())
-        pupil, shown = pupil.with_learnt(self.aperture()), self.state if self.moment is None else self.moment
-        return pupil if shown is None else pupil.of_masks(slice(shown, shown + 1))
+        shown = self.state if self.moment is None else self.moment
+        if self.lens is None:
+            pupil = pupil.with_amplitude(amplitude)
+            return pupil if shown is None else pupil.of_masks(slice(shown, shown + 1))
+        if amplitude.ndim == 2:
+            return pupil.cut_by_a_lens(amplitude)
+        times = self.timeline(torch.promote_types(self.masks.phase.dtype, torch.float32)).durations
+        if shown is not None:
+            amplitude, times = amplitude[shown : shown + 1], torch.ones_like(times[:1])
+        return pupil.cut_by_a_lens(amplitude, times)
+
+    @property
+    def _amplitude(self) -> Tensor | None:
+        """Amplitude that is learnt, or one of several, one for each mask."""
+        amplitude = self.aperture() if isinstance(self.aperture, LearnableAperture) else self.aperture
+        if amplitude is None or (amplitude.ndim == 2 and amplitude is self.aperture):
+            return None
+        if amplitude.ndim == 3:
+            shown = self.timeline(torch.float32)
+            if shown.mixture is not None or len(shown.states) != len(amplitude):
+                raise ValueError(
+                    f"an aperture for each mask needs a modulator that shows the {len(amplitude)} masks one by one, "
+                    f"such as DwellTimes(), got {len(shown.states)} states: give one aperture (N, N) for all"
+                )
+        return amplitude
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
@@ -760,7 +777,7 @@ class PSFModel:
         camera, known, step = self.camera, self._derived.window, self.pixel_step
         if self.measured is not None or self.lens is not None or self.spectrum.basis is not None:
             return None
-        if isinstance(self.aperture, LearnableAperture):
+        if self._amplitude is not None:
             return None
         if not self.fidelity.blurs_by_rays:
             return None

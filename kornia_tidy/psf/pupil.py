@@ -22,7 +22,7 @@ class Pupil:
 
     Args:
         amplitude: (n, n) in [0, 1], or an :class:`~kornia_tidy.optics.aperture.OpenArea`. Of a learnable aperture
-            (n, n) or one for each mask, (K, n, n), scaled to let a light of one through.
+            (n, n) or of one for each mask, (K, n, n): scaled to let a light of one through, unless a lens cuts it.
         cell_pitch: side of a cell in pupil radii.
         fill_factor: share of the area of each mask pixel that modulates, a square in its middle.
         light: that it lets through, in units of squared amplitude times pupil radii squared. Default: the open area of
@@ -63,8 +63,8 @@ class Pupil:
         """Share of the light in the field of the cells: 1, and less where cells at a hard edge hold its mean only."""
         return min(1.0, float(self.amplitude.double().square().sum()) * self.cell_pitch**2 / self.light)
 
-    def with_learnt(self, amplitude: Tensor) -> Pupil:
-        """Return this pupil with amplitudes that are learnt: of one light each, and sampled where this pupil is open.
+    def with_amplitude(self, amplitude: Tensor) -> Pupil:
+        """Return this pupil with amplitudes learnt or of each mask: of one light each, sampled where this pupil is open.
 
         Args:
             amplitude: (n, n), or (K, n, n) for K masks.
@@ -76,10 +76,17 @@ class Pupil:
         vars(pupil).update(amplitude=amplitude / light.sqrt(), transmission=transmission, light=1.0)
         return pupil
 
-    def cut_by_a_lens(self, amplitude: Tensor) -> Pupil:
-        """Return this pupil with a learnt amplitude (n, n), not scaled to one light: a lens's stop cuts it too."""
+    def cut_by_a_lens(self, amplitude: Tensor, shares: Tensor | None = None) -> Pupil:
+        """Return this pupil with amplitudes that are not scaled to one light: a lens's stop cuts them too.
+
+        Args:
+            amplitude: (n, n), or (K, n, n) for K masks.
+            shares: of the time of each mask, (K,), by which the light of several amplitudes adds up.
+        """
         pupil = copy.copy(self)
         transmission = amplitude.double().square()
+        if shares is not None:
+            transmission = torch.tensordot(shares.to(transmission), transmission, 1)
         light = float(transmission.detach().sum()) * self.cell_pitch**2
         vars(pupil).update(amplitude=amplitude, transmission=transmission.cpu(), light=light)
         return pupil

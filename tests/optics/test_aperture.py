@@ -134,8 +134,8 @@ class TestCheckAperture(BaseTester):
         assert checked[0, 0] == 1
 
     def test_exception_shape(self, device, dtype):
-        for shape in ((4, 5), (5,), (1, 5, 5), (4, 4)):
-            with pytest.raises(ValueError, match=r"aperture must have shape \(5, 5\), got"):
+        for shape in ((4, 5), (5,), (0, 5, 5), (1, 4, 5), (4, 4), (1, 1, 5, 5)):
+            with pytest.raises(ValueError, match=r"aperture must have shape \(5, 5\), or \(K, 5, 5\) .* K masks, got"):
                 check_aperture(torch.ones(shape, device=device, dtype=dtype), 5)
 
     @pytest.mark.parametrize("bad", [-0.5, 1.5, math.nan, math.inf, -math.inf])
@@ -148,6 +148,8 @@ class TestCheckAperture(BaseTester):
     def test_exception_a_closed_pupil_is_refused(self, device, dtype):
         with pytest.raises(ValueError, match="must let some light through, got 0 open cells"):
             check_aperture(torch.zeros(5, 5, device=device, dtype=dtype), 5)
+        with pytest.raises(ValueError, match="must let some light through, got 0 open cells"):  # of one of two masks
+            check_aperture(torch.stack([torch.zeros(5, 5), torch.ones(5, 5)]), 5)
 
     def test_exception_a_complex_pupil_is_refused(self, device):
         with pytest.raises(TypeError, match="real amplitude"):

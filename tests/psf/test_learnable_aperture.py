@@ -33,9 +33,9 @@ def camera(aperture, masks=3, **options) -> TiDyOptics:
     return TiDyOptics(PixelwiseMask(masks), aperture=aperture, **options)
 
 
-def through_a_lens(aperture) -> TiDyOptics:
+def through_a_lens(aperture, fidelity: Fidelity = SMALL, **options) -> TiDyOptics:
     given = {"camera": LENS.camera(8e-6), "lens": LENS, "field_center": (400.0, -480.0)}
-    return camera(aperture, fidelity=SMALL.replace(field_tolerance=0.1), **given)
+    return camera(aperture, fidelity=fidelity.replace(field_tolerance=0.1), **given, **options)
 
 
 def scene(dtype=torch.float32):
@@ -78,8 +78,9 @@ class TestLearnableAperture(BaseTester):
             camera(apertures(2))
         with pytest.raises(ValueError, match=r"shows the 3 masks one by one, such as .*, got"):
             camera(apertures(), modulator=Switching(8e-3))
-        with pytest.raises(ValueError, match=r"behind a real lens must be one .* for all masks, got \(3, 23, 23\)"):
-            camera(apertures(), camera=LENS.camera(8e-6), lens=LENS)
+        for given in (apertures(2), apertures(2).detach()):
+            with pytest.raises(ValueError, match=r"shows the 2 masks one by one, such as .*, got 3 states"):
+                through_a_lens(given)
 
     def test_exception_learning_that_closed_it(self):
         optics = camera(apertures())
@@ -142,6 +143,62 @@ class TestLearnableAperture(BaseTester):
         for shape in ((23, 23), (3, 23, 23)):
             learnt = camera(nn.Parameter(amplitude.expand(shape).clone()), **options)
             self.assert_close(learnt.psf_bank().psfs, camera(amplitude, **options).psf_bank().psfs)
+
+    @pytest.mark.parametrize("learnt", [False, True])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_feature_masks_behind_a_lens_count_by_the_light_that_passes_its_stop(self, compositing, learnt):
+        """As the next test; a cell that the stop cuts counts by its open part."""
+        amplitude, times = apertures(), torch.tensor([0.25, 0.5, 0.25])
+        with torch.no_grad():
+            amplitude[1, :12] *= 0.5
+        modulator = DwellTimes((1, 2, 1))
+        options = {"compositing": compositing, "fidelity": SMALL.replace(stray_light="discard")}
+        given = amplitude if learnt else amplitude.detach()
+        optics = through_a_lens(given, modulator=modulator, **options)
+        disc = circular_aperture(23, 0.1, edges="area").double()
+        light = (amplitude.detach().double().square() * disc).sum((1, 2)) * times
+        light = (light / light.sum()).float()
+        self.assert_close(optics.state_weights(torch.float32), light, rtol=1e-4, atol=0)
+        captures = []
+        with torch.no_grad():
+            for k, height in enumerate(optics.masks.heights()):
+                alone = through_a_lens(amplitude[k].detach(), **options)
+                alone.masks = PixelwiseMask(1, initial=height[None])
+                captures.append(alone(*scene()))
+                self.assert_close(optics.through_state(k)(*scene()), captures[k], rtol=0, atol=2e-6)
+            expected = sum(share * capture for share, capture in zip(light, captures, strict=True))
+            self.assert_close(optics(*scene()), expected, rtol=0, atol=2e-5)
+            image, depth = (part[:, None].repeat(1, 3, 1, 1, 1) for part in scene())
+            self.assert_close(moving_capture(optics, image, depth), expected, rtol=0, atol=2e-5)
+            self.assert_close(burst(optics, *scene()).sum(1), expected, rtol=0, atol=2e-5)
+            made = camera_of_state(optics.state_dict())
+            made.field_center = optics.field_center
+            self.assert_close(made(*scene()), optics(*scene()), rtol=0, atol=1e-6)
+
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    def test_gradcheck_of_amplitudes_behind_a_lens(self, compositing):
+        """Along a direction, against differences of captures."""
+        amplitude = apertures(3, dtype=torch.float64)
+        optics = through_a_lens(amplitude, fidelity=EXACT, compositing=compositing)
+        generator = torch.Generator().manual_seed(6)
+        way, weight = (torch.randn(s, generator=generator).double() for s in (amplitude.shape, (1, 3, 24, 26)))
+
+        def seen() -> torch.Tensor:
+            return (optics(*scene(torch.float64)) * weight).sum()
+
+        slope = float((torch.autograd.grad(seen(), optics.aperture.amplitude)[0] * way).sum())
+        with torch.no_grad():
+            ends = []
+            for step in (1e-5, -2e-5):
+                optics.aperture.amplitude.add_(step * way)
+                ends.append(float(seen()))
+        assert abs((ends[0] - ends[1]) / 2e-5 / slope - 1) < 1e-3
+
+    def test_feature_a_given_amplitude_for_each_mask_is_the_learnable_one(self):
+        amplitude = apertures()
+        self.assert_close(camera(amplitude)(*scene()), camera(amplitude.detach())(*scene()), rtol=0, atol=1e-6)
+        given = camera(amplitude.detach())
+        assert torch.equal(camera_of_state(given.state_dict())(*scene()), given(*scene()))
 
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_feature_masks_count_by_the_light_that_passes(self, compositing):
