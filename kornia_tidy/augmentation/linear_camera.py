@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from kornia_tidy.camera.strips import Strip
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
-from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.field import Field, check_centers
 from kornia_tidy.psf.psf_bank import PSFBank
 
 _WANTED = [True, False, False, False, False]  # of image, defocus, nodes, PSFs and stray light
@@ -29,6 +29,8 @@ class LinearCamera(nn.Module):
         depth: (B, 1, H, W), (1, 1, H, W) or (1, H, W), as the camera takes it.
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
             does; ``"error"`` leaves them to the camera. :attr:`valid` is False where they were.
+        field_center: where the middle of the picture lies from the axis of a lens, (2,), or of each image, (B, 2): y
+            and x in sensor pixels. Default: the camera's.
 
     Shape:
         - ``camera(x)``: (B, C, H, W) linear light to (B, C, H, W) irradiance, smaller for the border ``"valid"``.
@@ -56,7 +58,7 @@ class LinearCamera(nn.Module):
     valid: Tensor | None
     """Where the depth was known, (B, 1, H, W) bool, if holes are filled."""
 
-    def __init__(self, optics: TiDyOptics, depth: Tensor, holes: str = "error") -> None:
+    def __init__(self, optics: TiDyOptics, depth: Tensor, holes: str = "error", field_center: Any = None) -> None:
         super().__init__()
         check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics()")
         if optics.compositing == "occlusion":
@@ -66,18 +68,21 @@ class LinearCamera(nn.Module):
         check_float_tensor("depth", depth, 3 if depth.ndim == 3 else 4, "(B, 1, H, W) or (1, H, W)")
         check_choice("holes", holes, HOLES)
         self.optics = optics
+        self.field_center = field_center
         depth, valid = depth[None] if depth.ndim == 3 else depth, None
         if fills_holes(optics, holes):
             depth, valid = fill_holes(depth)
         self.register_buffer("depth", depth, persistent=False)
         self.register_buffer("valid", valid, persistent=False)
         optics.defocus(depth)  # raises
+        if field_center is not None and len(depth) > 1:
+            check_centers(field_center, len(depth))  # raises too; places of images with one depth on use
 
     def forward(self, light: Tensor) -> Tensor:
         """Return the irradiance A x of linear light x."""
         check_float_tensor("light", light, 4, "(B, C, H, W)")
         self._check("light", light, (self.depth.shape[-2], self.depth.shape[-1]))
-        if self._field is not None:
+        if self._fields(len(light)):
             return self._through_lens(light)
         scene, options = self._scene(light.shape[1], light.dtype)
         image = light.to(scene[0].dtype)
@@ -89,21 +94,23 @@ class LinearCamera(nn.Module):
         cut = self.optics.window - 1 if self.optics.border == "valid" else 0
         rows, columns = self.depth.shape[-2:]
         self._check("irradiance", irradiance, (rows - cut, columns - cut))
-        if self._field is not None:
+        if self._fields(len(irradiance)):
             return _Transpose.apply(irradiance, self._through_lens, (rows, columns))
         scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
         plain = [part if part is None else part.detach() for part in scene]
         return _Adjoint.apply(irradiance.to(plain[0].dtype), *plain, *options).to(irradiance.dtype)
 
-    @property
-    def _field(self) -> Field | None:
+    def _fields(self, count: int) -> tuple[Field, ...]:
+        """Return where the images of a batch lie in the field: one place, or one for each; none of an ideal lens."""
         size = self.depth.shape[-2], self.depth.shape[-1]
-        return self.optics.psf_model.field_of(size, self.optics.field_center)
+        centers = check_centers(self.optics.field_center if self.field_center is None else self.field_center, count)
+        found = [self.optics.psf_model.field_of(size, center) for center in centers]
+        return tuple(field for field in found if field is not None)
 
     def _through_lens(self, light: Tensor) -> Tensor:
         optics, dtype = self.optics, self._dtype(light.dtype)
         defocus = optics.defocus(self.depth.to(dtype))
-        strip = Strip(light.to(dtype), defocus, defocus, optics.border, fields=(cast("Field", self._field),))
+        strip = Strip(light.to(dtype), defocus, defocus, optics.border, fields=self._fields(len(light)))
         return optics.blurred(strip).to(light.dtype)
 
     def _dtype(self, dtype: torch.dtype) -> torch.dtype:

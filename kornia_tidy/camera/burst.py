@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,7 @@ def burst(
     dead_time: float = 0.0,
     exposure: float = 0.1,
     generator: torch.Generator | None = None,
+    field_center: Any = None,
 ) -> Tensor:
     """Take one picture through each mask instead of one through all: the same scene, camera and interval.
 
@@ -63,6 +64,8 @@ def burst(
         dead_time: seconds between shots in which no light is collected: readout or switching, whichever is longer.
         exposure: seconds from the start of the first shot to the end of the last.
         generator: source of the noise. Default: the global generator.
+        field_center: where the middle of the picture lies from the axis of a lens, (2,), or of each image, (B, 2): y
+            and x in sensor pixels. Default: the camera's.
 
     Returns:
         Linear light in the units of one full exposure: (B, K, C, H, W), or (K, C, H, W) for an unbatched image. Without
@@ -87,7 +90,7 @@ def burst(
         >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
         torch.Size([2, 3, 80, 80])
     """
-    sample = read_sample(image, depth, optics)
+    sample = read_sample(image, depth, optics, field_center=field_center)
     shots, light = [], optics.psf_model.relative_light(sample.dtype)
     for k, share in enumerate(burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)):
         shot = optics.through_moment(k).irradiance(sample)

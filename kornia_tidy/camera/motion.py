@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from kornia.geometry import remap
@@ -20,6 +21,7 @@ def moving_capture(
     depths: Tensor,
     params: Mapping[str, Tensor] | None = None,
     generator: torch.Generator | None = None,
+    field_center: Any = None,
 ) -> Tensor:
     r"""Take one picture of a scene that moves during the exposure.
 
@@ -39,6 +41,8 @@ def moving_capture(
         depths: (B, M, 1, H, W) or (M, 1, H, W).
         params: noise drawn before by ``optics.draw(images[:, 0])``.
         generator: source of the noise. Default: the global generator.
+        field_center: where the middle of the picture lies from the axis of a lens, (2,), or of each item, (B, 2): y and
+            x in sensor pixels. Default: the camera's.
 
     Returns:
         (B, C, H, W) or (C, H, W), encoded as the images and of their type; smaller with ``border="valid"``.
@@ -85,7 +89,7 @@ def moving_capture(
                 )
         total, clamped = torch.zeros(()), 0
         for moment, share in enumerate(durations * optics.psf_model.relative_light(dtype)):
-            sample = read_sample(images[:, moment], depths[:, moment], optics)
+            sample = read_sample(images[:, moment], depths[:, moment], optics, field_center=field_center)
             light = optics.through_moment(moment).irradiance(sample) * share
             total = light if moment == 0 else total + light
             clamped += optics.clamped_pixels

@@ -64,7 +64,7 @@ class Pupil:
         return min(1.0, float(self.amplitude.double().square().sum()) * self.cell_pitch**2 / self.light)
 
     def with_amplitude(self, amplitude: Tensor) -> Pupil:
-        """Return this pupil with amplitudes learnt or of each mask: of one light each, sampled where this pupil is open.
+        """Return this pupil with amplitudes, learnt or one for each mask, of one light each; its open part stays.
 
         Args:
             amplitude: (n, n), or (K, n, n) for K masks.

@@ -56,6 +56,27 @@ class TestLinearCamera(BaseTester):
         size = (operator(x.abs()).double().abs() * y.abs().double()).sum()
         assert (left - right).abs() < 2 * gamma(3 * 9 * 9 * 5, kind) * size
 
+    def test_feature_each_image_has_its_place_behind_a_lens(self):
+        """Of a depth for each image, and of one for all; the transpose too."""
+        fidelity = Fidelity(window=9, layer_spacing=20.0)
+        optics = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity=fidelity, sensor=None, color_space="linear")
+        places, image = [(450.0, 520.0), (0.0, -20.0)], torch.rand(2, 3, 24, 30)
+        depth = torch.linspace(0.4, 2.0, 2 * 24 * 30).view(2, 1, 24, 30)
+        for own in (depth, depth[:1]):
+            operator = LinearCamera(optics, own, field_center=torch.tensor(places))
+            alone = [
+                LinearCamera(optics, d, field_center=at)
+                for d, at in zip(own.expand(2, -1, -1, -1), places, strict=True)
+            ]
+            self.assert_close(operator(image), optics(image, own, field_center=places), rtol=0, atol=1e-6)
+            for move in (lambda a, x: a(x), lambda a, x: a.adjoint(x)):
+                one_by_one = torch.cat([move(a, x) for a, x in zip(alone, image[:, None], strict=True)])
+                self.assert_close(move(operator, image), one_by_one, rtol=0, atol=1e-5)
+        with pytest.raises(ValueError, match="one place, or one for each of 2 images, got 3"):
+            LinearCamera(optics, depth, field_center=[(0.0, 0.0)] * 3)
+        with pytest.raises(ValueError, match="one place, or one for each of 1 images, got 2"):
+            operator(image[:1])
+
     def test_feature_it_is_the_capture_in_linear_light_without_noise(self):
         image, depth = scene(2)
         for compositing in ("gather", "scatter"):

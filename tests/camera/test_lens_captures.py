@@ -13,7 +13,7 @@ import torch
 from torch.nn.functional import pad
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.camera import camera_of_state
+from kornia_tidy.camera import burst, camera_of_state, moving_capture
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
 from kornia_tidy.psf import PSFBank
@@ -219,6 +219,20 @@ class TestLensCaptures(BaseTester):
         seen.append(optics(image, depth, field_center=centers))
         for captures in seen:
             self.assert_close(captures, torch.cat(alone), rtol=0, atol=1e-5)
+
+    @torch.no_grad()
+    def test_feature_each_item_of_a_burst_and_of_a_moving_scene_has_its_place(self):
+        settings = SETTINGS.replace(stray_light="discard")
+        optics, places = camera(center=(0.0, 0.0), fidelity=settings), [(450.0, 520.0), (0.0, -20.0)]
+        image, depth = (torch.cat([part, part]) for part in scene(24, 30))
+        expected = optics(image, depth, field_center=places)
+        assert float((expected[0] - expected[1]).abs().max()) > 0.02
+        self.assert_close(burst(optics, image, depth, field_center=places).sum(1), expected, rtol=0, atol=1e-5)
+        moments = [part[:, None].repeat(1, 2, 1, 1, 1) for part in (image, depth)]
+        self.assert_close(moving_capture(optics, *moments, field_center=places), expected, rtol=0, atol=1e-5)
+        for take, given in ((burst, (image, depth)), (moving_capture, moments)):
+            with pytest.raises(ValueError, match="one place, or one for each of 2 images, got 3"):
+                take(optics, *given, field_center=[(0.0, 0.0)] * 3)
 
     @torch.no_grad()
     def test_feature_noise_does_not_depend_on_whether_places_differ(self):
