@@ -703,7 +703,8 @@ class PSFModel:
                 aperture = torch.ones(amplitude.shape[-2:])
             elif self.lens is not None and self.aperture is None:  # its stop is the edge
                 aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
-            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, aperture, fill_factor)
+            given = cast("Tensor | None", aperture)
+            pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, given, fill_factor)
         if (amplitude := self._amplitude) is None:
             return pupil
         shown = self.state if self.moment is None else self.moment
