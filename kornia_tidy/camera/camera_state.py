@@ -26,6 +26,7 @@ from kornia_tidy.psf.camera_settings import (
     take_over,
     write_settings,
 )
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.lens_limits import PARTS
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -217,11 +218,13 @@ class CameraState(nn.Module):
         """
         return self._replace(psf_model=self.psf_model.through_moment(moment))
 
-    def with_bank(self, bank: PSFBank) -> Self:
+    def with_bank(self, bank: PSFBank | FieldBank) -> Self:
         """Return this camera with PSFs that were measured in the place of its masks'. The other parts are shared.
 
         Args:
-            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them.
+            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them. Of one
+                over the field, see :meth:`kornia_tidy.psf.FieldBank.from_measured`, each pixel sees the PSFs of its
+                place.
         """
         return self._replace(psf_model=self.psf_model.with_bank(bank))
 

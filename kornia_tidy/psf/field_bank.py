@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite
+from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
+from kornia_tidy.psf.measured_field import place_weights
 from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
+from kornia_tidy.tensor_files import read_tensors
 
 _LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
+_FORMAT = "kornia_tidy.field_bank/1"
 FEWEST_CELLS = 23  # along a side of the stop, where they are alike
 
 
@@ -91,6 +98,110 @@ class FieldBank:
         veil = None if self.veil is None else mixed(self.veil)
         return PSFBank(mixed(self.psfs), self.defocus, mixed(self.energy), veil)
 
+    def at_places(self, places: Sequence[tuple[float, float]]) -> FieldBank:
+        """Return measured PSFs at other points of the field, see :func:`~kornia_tidy.psf.measured_field.place_weights`.
+
+        Args:
+            places: (y, x) in sensor pixels from the axis.
+        """
+        weights = place_weights(self.field, places)
+
+        def mixed(values: Tensor) -> Tensor:
+            return torch.tensordot(weights.to(values), values, 1)
+
+        veil = None if self.veil is None else mixed(self.veil)
+        there = self.field.new_tensor([list(place) for place in places])
+        return FieldBank(mixed(self.psfs), self.defocus, there, mixed(self.energy), mixed(self.light), veil)
+
+    def at_defocus(self, defocus: Sequence[float]) -> FieldBank:
+        """Return the PSFs at other defocus, mixed linearly, see :meth:`~kornia_tidy.psf.PSFBank.at_defocus`."""
+        mixed = [self.at(index).at_defocus(defocus) for index in range(len(self.psfs))]
+        shares = [PSFBank(p[..., None, None], self.defocus, p).at_defocus(defocus).energy for p in self.light]
+        psfs, energy = (torch.stack([getattr(bank, name) for bank in mixed]) for name in ("psfs", "energy"))
+        return FieldBank(psfs, mixed[0].defocus, self.field, energy, torch.stack(shares))
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> FieldBank:
+        """Return the bank on a device and in a data type; None: unchanged."""
+        present = {name: value for name, value in vars(self).items() if value is not None}
+        return FieldBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
+
+    def with_tails(self) -> FieldBank:
+        """Return a bank with PSFs that are zero nowhere, see :meth:`~kornia_tidy.psf.PSFBank.with_tails`."""
+        places = len(self.psfs)
+        flat = PSFBank(self.psfs.flatten(0, 1), self.defocus.repeat(places), self.energy.flatten(0, 1))
+        return replace(self, psfs=flat.with_tails().psfs.unflatten(0, (places, -1)))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the bank as safetensors, all or nothing.
+
+        Raises:
+            FileNotFoundError: if the folder does not exist.
+        """
+        present = {k: v.detach().cpu().contiguous() for k, v in vars(self).items() if v is not None}
+        write_bytes(path, save(present, metadata={"format": _FORMAT}))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> FieldBank:
+        """Read a bank written by :meth:`save`.
+
+        Raises:
+            FileNotFoundError: if the file is missing.
+            ValueError: if the file is not such a bank, or a value is NaN or infinite.
+        """
+        tensors, notes = read_tensors(path, "PSF bank over the field", device)
+        needed = {"psfs", "defocus", "field", "energy", "light"}
+        if notes.get("format") != _FORMAT or not needed <= set(tensors) <= {*needed, "veil"}:
+            found = f"{notes.get('format')!r:.40} with {sorted(tensors)!r:.200}"
+            raise ValueError(f"{path} is not a PSF bank over the field: its format is {found}")
+        for name, value in tensors.items():
+            check_finite(f"{name} of {path}", value)
+        try:
+            return cls(**tensors)
+        except ValueError as error:
+            raise ValueError(f"cannot read {path}: {error}") from None
+
+    @classmethod
+    def from_measured(
+        cls, banks: Sequence[PSFBank], field: Sequence[tuple[float, float]], light: Sequence[float] | None = None
+    ) -> FieldBank:
+        """Return PSFs measured at several places of the picture, for ``optics.with_bank``.
+
+        Args:
+            banks: of each place, such as ``PSFBank.load`` reads from a file of ``kornia-tidy raw calibrate-psf``, with
+                the same defocus, colours and window.
+            field: the places, y and x in sensor pixels from the lens's axis: one or more, in any arrangement.
+            light: of an even scene at each place over that on the axis. Default: 1, no vignetting.
+
+        Raises:
+            TypeError: if the places are not numbers.
+            ValueError: if there is not one place for each bank, or banks differ in defocus, colours or window.
+
+        Example:
+            >>> banks = [PSFBank.from_measured(torch.rand(2, 3, 5, 5), torch.tensor([-5.0, 5.0])) for _ in range(3)]
+            >>> FieldBank.from_measured(banks, [(0, 0), (0, 600), (500, 0)]).psfs.shape
+            torch.Size([3, 2, 3, 5, 5])
+        """
+        places = checked_places(field)
+        shares = [1.0] * len(places) if light is None else [float(share) for share in light]
+        if not len(banks) == len(places) == len(shares) or len(set(places)) < len(places):
+            raise ValueError(
+                f"each bank must have its own place and light, got {len(banks)} banks, {len(set(places))} different "
+                f"places and {len(shares)} values of light"
+            )
+        if not all(0 < share < math.inf for share in shares):
+            raise ValueError(f"light must be positive, got {shares!r:.80}")
+        first = banks[0]
+        for bank in banks:
+            if bank.psfs.shape != first.psfs.shape or not torch.allclose(bank.defocus, first.defocus, 1e-4, 1e-4):
+                raise ValueError(
+                    f"banks of all places must have the same defocus, colours and window, got "
+                    f"{tuple(first.psfs.shape)} and {tuple(bank.psfs.shape)}: take bank.at_defocus(nodes) of each"
+                )
+        there = first.psfs.new_tensor(shares)[:, None, None].expand(-1, *first.energy.shape).contiguous()
+        psfs = torch.stack([bank.psfs for bank in banks]) * there[..., None, None]
+        energy, points = torch.stack([bank.energy for bank in banks]), first.psfs.new_tensor(places)
+        return cls(psfs, first.defocus, points, energy, there)
+
     def with_stray_light(self, kind: str) -> FieldBank:
         """Return a bank in which the light outside the window is dealt with.
 
@@ -118,6 +229,12 @@ def check_field(field: Sequence[tuple[float, float]], lens: Lens | None) -> list
         raise ValueError(
             "field points need a camera with a lens, got none: give it lens='double-gauss-50mm' or another"
         )
+    return checked_places(field)
+
+
+@on_cpu
+def checked_places(field: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return points of the field, or raise ``ValueError`` or ``TypeError`` for other values."""
     try:
         points = torch.as_tensor(field, dtype=torch.float64)
     except (TypeError, ValueError):

@@ -32,11 +32,19 @@ from kornia_tidy.psf.defocus_interpolation import (
 )
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.field import Field, check_center
-from kornia_tidy.psf.field_bank import FieldBank, check_field, field_light, field_psf_bank, light_on_axis
+from kornia_tidy.psf.field_bank import (
+    FieldBank,
+    check_field,
+    checked_places,
+    field_light,
+    field_psf_bank,
+    light_on_axis,
+)
 from kornia_tidy.psf.field_nodes import field_nodes
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
+from kornia_tidy.psf.measured_field import measured_nodes
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import MEMORY, nodes_around, values_of
@@ -102,7 +110,7 @@ class PSFModel:
     spectrum: Spectrum
     aperture: Tensor | LearnableAperture | None
     lens: Lens | None
-    measured: PSFBank | None  # PSFs in the place of the masks' own
+    measured: PSFBank | FieldBank | None  # PSFs in the place of the masks' own
     state: int | None  # the one state looked through, if not all
     moment: int | None  # the one moment looked at, if not the whole exposure
     measured_cut: bool  # whether measured PSFs are zero somewhere
@@ -214,6 +222,9 @@ class PSFModel:
         """
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = dtype or (torch.float64 if self.fidelity.double else torch.float32)
+        if field is not None and isinstance(self.measured, FieldBank):
+            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device, checked_places(field))
+            return bank if defocus is None else bank.at_defocus(defocus)
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
             nodes = self.defocus_nodes if defocus is None else tuple(defocus)
@@ -269,7 +280,8 @@ class PSFModel:
         """
         spectrum = self._sampled if channels == len(self.spectrum.weights) else self.spectrum_of(channels)
         if self.measured is not None:
-            return self._measured_bank(spectrum, dtype, device or defocus.device)
+            places = None if field is None else field.points
+            return self._measured_bank(spectrum, dtype, device or defocus.device, places)
         nodes, kind = self.defocus_nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         if kind in ("nearest", "linear"):
@@ -322,7 +334,7 @@ class PSFModel:
             ValueError: if it is not finite.
             NotImplementedError: while torch compiles or exports, which needs values.
         """
-        if self.lens is None or self.measured is not None:
+        if not self.varies:
             return None
         if torch.compiler.is_compiling():
             raise NotImplementedError(
@@ -330,13 +342,19 @@ class PSFModel:
                 "leave lens= out"
             )
         known, lens, camera, center = self._derived.fields, self.lens, self.camera, check_center(center)
-        asked = size, center, lens.table, camera.pixel_pitch, camera.defocus_range
+        table, tolerance = None if lens is None else lens.table, self.fidelity.field_tolerance
+        asked = size, center, table, camera.pixel_pitch, camera.defocus_range, self.measured
         if (field := known.get(asked)) is None:
-            rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
-            corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
-            self._warn_if_beyond(corners, camera.defocus_range)
-            given = camera.defocus_range, min(self._sampled.wavelengths), camera.pixel_pitch, self.window / 4
-            field = known[asked] = field_nodes(size, center, lens, *given, self.fidelity.field_tolerance)
+            if lens is None or self.measured is not None:
+                bank = cast("FieldBank", self.measured)
+                field = measured_nodes(bank.psfs, bank.field, size, center, tolerance)
+            else:
+                rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
+                corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
+                self._warn_if_beyond(corners, camera.defocus_range)
+                given = camera.defocus_range, min(self._sampled.wavelengths), camera.pixel_pitch, self.window / 4
+                field = field_nodes(size, center, lens, *given, tolerance)
+            known[asked] = field
             if len(known) > MOST_FIELDS:
                 known.pop(next(iter(list(known))), None)
         return field
@@ -461,10 +479,19 @@ class PSFModel:
             return operator_psf_bank(*light, step, window, tolerance, shift)
         return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._remembers)
 
-    def _measured_bank(self, spectrum: Spectrum, dtype: torch.dtype, device: torch.device | None = None) -> PSFBank:
-        bank = cast("PSFBank", self.measured)
-        if bank.psfs.shape[1] != len(spectrum.weights):
-            raise ValueError(f"the measured PSFs have {bank.psfs.shape[1]} channels, not {len(spectrum.weights)}")
+    def _measured_bank(
+        self,
+        spectrum: Spectrum,
+        dtype: torch.dtype,
+        device: torch.device | None = None,
+        places: Sequence[tuple[float, float]] | None = None,
+    ) -> Any:
+        bank = cast("PSFBank | FieldBank", self.measured)
+        if bank.psfs.shape[-3] != len(spectrum.weights):
+            raise ValueError(f"the measured PSFs have {bank.psfs.shape[-3]} channels, not {len(spectrum.weights)}")
+        if isinstance(bank, FieldBank):
+            bank = bank.at_places(AXIS if places is None else places)
+            bank = bank.at(0) if places is None else bank
         return bank.to(device, dtype)
 
     # ------------------------------------------------------------------ the exposure
@@ -579,11 +606,12 @@ class PSFModel:
             raise ValueError(f"moment must be from 0 to {count - 1}, got {moment}")
         return self._replace(moment=moment, _derived=CachedParts(self.fitted))
 
-    def with_bank(self, bank: PSFBank) -> Self:
+    def with_bank(self, bank: PSFBank | FieldBank) -> Self:
         """Return this model with PSFs that were measured in the place of its masks'. The other parts are shared.
 
         Args:
-            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them.
+            bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them. Of one
+                over the field each pixel sees the PSFs of its place, whether or not there is a lens.
 
         Example:
             >>> measured = PSFBank.from_measured(torch.rand(2, 3, 5, 5), torch.tensor([-5.0, 5.0]))
@@ -624,6 +652,11 @@ class PSFModel:
             spacing = min(spacing, interpolable_spacing(self._band()))
         intervals = max(1, round((hi - lo) / spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
+
+    @property
+    def varies(self) -> bool:
+        """Whether PSFs have a place in the picture: behind a real lens, or measured at several places."""
+        return self.lens is not None if self.measured is None else isinstance(self.measured, FieldBank)
 
     @property
     def fixed_window(self) -> int | None:
@@ -812,12 +845,13 @@ class PSFModel:
         if self.lens is None:  # nor this
             fidelity.pop("field_tolerance")
         bank = self.measured
+        over_field = (bank.field, bank.light) if isinstance(bank, FieldBank) else ()
         return {
             **{name: settings_of(getattr(self, name)) for name in ("masks", "camera", "modulator", "spectrum")},
             "fidelity": fidelity,
             "mask_pixels": list(self.masks.phase.shape[-2:]),
             "aperture": settings_of(self.aperture),
-            "measured PSFs": None if bank is None else digest_of(bank.psfs, bank.defocus, bank.energy),
+            "measured PSFs": None if bank is None else digest_of(bank.psfs, bank.defocus, bank.energy, *over_field),
             **({} if self.lens is None else {"lens": settings_of(self.lens)}),
             "state": self.state,
             "moment": self.moment,

@@ -95,7 +95,7 @@ class LightHead(nn.Module):
         self.camera = cast("ThinLensCamera", system.optics.camera)  # another one where no depth is estimated
         self.encoded = system.optics.color_space == "srgb"
         self.uncertain = system.settings.depth_classes > 0
-        behind = system.settings.head in CLOSED_FORMS and system.optics.lens is not None
+        behind = system.settings.head in CLOSED_FORMS and system.optics.psf_model.varies
         self.field = (system.optics.psf_model, system.optics.field_center) if behind else None  # no part of the head
         self.eval()
 

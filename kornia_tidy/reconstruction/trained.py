@@ -18,6 +18,7 @@ from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.psf.camera_settings import EXTRA_STATE, check_settings, read_settings, settings_of
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.any_camera import any_camera_head
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm, closed_form_channels
@@ -174,7 +175,7 @@ def closed_form_bank(optics: TiDyOptics, layers: int = 0) -> PSFBank:
 def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:
     """Return a camera's PSFs for 1 channel, green, or 3; measured ones of the one number serve for the other."""
     measured = optics.psf_model.measured
-    if measured is None:
+    if measured is None or isinstance(measured, FieldBank):
         return optics.psf_bank(channels, defocus=nodes)
     return measured.to(optics.masks.phase.device).at_defocus(nodes).with_channels(channels)
 
