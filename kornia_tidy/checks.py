@@ -6,6 +6,8 @@ separate from checks of shapes and types.
 
 from __future__ import annotations
 
+import math
+import operator
 import sys
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
@@ -38,7 +40,7 @@ def check_not_negative(name: str, value: float, unit: str = "") -> None:
 
 def check_number(name: str, value: Any, unit: str = "") -> None:
     """Raise ``TypeError`` unless ``value`` is a single number."""
-    if isinstance(value, str) or not hasattr(value, "__float__"):
+    if isinstance(value, str) or not hasattr(value, "__float__") or math.prod(getattr(value, "shape", ())) != 1:
         raise TypeError(f"{name} must be a number{' in ' + unit if unit else ''}, got {described(value)}")
 
 
@@ -96,6 +98,14 @@ def check_generator(generator: Any) -> None:
             f"generator must be a torch.Generator such as torch.Generator().manual_seed({seed}), got "
             f"{described(generator)}"
         )
+
+
+def checked_seed(seed: Any) -> int:
+    """Return a seed as a plain integer, or raise ``TypeError`` unless it is a whole number of Python or NumPy."""
+    try:
+        return operator.index(seed)
+    except TypeError:
+        raise TypeError(f"seed must be a whole number, got {described(seed)}") from None
 
 
 def described(value: Any) -> str:

@@ -15,7 +15,7 @@ from torch import Tensor
 from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part, described, unmasked
+from kornia_tidy.checks import check_choice, check_part, check_positive, checked_seed, described, unmasked
 from kornia_tidy.choices import REPLACED
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
@@ -98,7 +98,7 @@ def simulate(
         raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
     if fills_holes(optics, holes):
         metres, _ = fill_holes(metres)
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    generator = None if seed is None else torch.Generator().manual_seed(checked_seed(seed))
     with torch.no_grad():
         coded = optics(pixels, metres, generator=generator, field_center=field_center)
     return to_array(coded, image.dtype, color, image.ndim)
@@ -143,6 +143,9 @@ def reconstruct(
         ((32, 48, 3), None)
     """
     pixels = to_tensor(unmasked("capture", capture), color)
+    check_positive("memory_budget", memory_budget, "bytes")
+    if not len(pixels):
+        raise ValueError(f"captures must be one or more, got shape {capture.shape}")
     light = pixels if linear else rgb_to_linear_rgb(pixels.expand(-1, 3, -1, -1))
     if isinstance(system, PSFBank):
         system = any_camera_system(system, sensor_of(light[0]))
@@ -215,7 +218,7 @@ def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Te
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
         kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
         raise TypeError(f"depth must be an array of integers or floats, got {kind}")
-    depth = np.ma.filled(depth, 0)
+    depth = np.asarray(np.ma.filled(depth, 0))
     if depth.ndim not in {2, 3, 4} or 0 in depth.shape[-2:] or (depth.ndim == 4 and depth.shape[3] != 1):
         raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
     scale = metres_per_unit(depth_scale, depth.dtype.kind != "f", depth.dtype)

@@ -17,12 +17,21 @@ from kornia_tidy.augmentation.lens_argument import lens_parts
 from kornia_tidy.augmentation.ranges import Range, checked_range
 from kornia_tidy.augmentation.rows import row_places
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
+from kornia_tidy.checks import (
+    check_choice,
+    check_depth,
+    check_float_tensor,
+    check_metres,
+    check_number,
+    check_positive,
+)
+from kornia_tidy.choices import COMPOSITING
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
 from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, PITCHES
 from kornia_tidy.render.compositing import render
 
 _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
@@ -116,16 +125,10 @@ def depth_blur(
     check_float_tensor("depth", depth, 4, "(B, 1, H, W) or (1, 1, H, W)")
     if not image.numel():
         return image
-    check_choice("color_space", color_space, COLOR_SPACES)
     for name, value in (("focus_distance", focus_distance), ("f_number", f_number)):
         if isinstance(value, Tensor) and value.numel() not in (1, len(image)):
             raise ValueError(f"{name} must be one number or one for each of {len(image)} images, got {value.numel()}")
-    for name, value in (("f_number", f_number), ("focal_length", focal_length), ("pixel_pitch", pixel_pitch)):
-        check_positive(name, float(value.min()) if isinstance(value, Tensor) else value)
-    check_positive("max_radius", max_radius, "pixels")
-    nearest = focus_distance.min() if isinstance(focus_distance, Tensor) else focus_distance
-    if not float(nearest) > focal_length:
-        raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {float(nearest)}")
+    _check_lens(focus_distance, f_number, focal_length, pixel_pitch, max_radius, compositing, color_space)
     if Mode.GRAPH not in torch_mode():
         check_depth(depth)
     dtype = torch.promote_types(image.dtype, torch.float32)
@@ -146,6 +149,28 @@ def depth_blur(
     if color_space == "srgb":
         blurred = linear_to_srgb(blurred)
     return blurred.to(image.dtype)
+
+
+def _check_lens(
+    focus_distance: float | Tensor,
+    f_number: float | Tensor,
+    focal_length: float,
+    pixel_pitch: float,
+    max_radius: float,
+    compositing: str,
+    color_space: str,
+) -> None:
+    """Raise an error unless these settings are those of a lens."""
+    check_choice("color_space", color_space, COLOR_SPACES)
+    check_choice("compositing", compositing, COMPOSITING)
+    nearest, fastest = (float(v.min()) if isinstance(v, Tensor) else v for v in (focus_distance, f_number))
+    check_positive("f_number", fastest)
+    check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+    check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
+    check_positive("max_radius", max_radius, "pixels")
+    check_number("focus_distance", nearest, "metres")
+    if not nearest > focal_length:
+        raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {nearest}")
 
 
 def disc_layer(radius: Tensor, max_radius: float) -> Tensor:
@@ -237,6 +262,7 @@ class DepthBlur(nn.Module):
         color_space: str = "srgb",
     ) -> None:
         super().__init__()
+        _check_lens(focus_distance, f_number, focal_length, pixel_pitch, max_radius, compositing, color_space)
         self.focus_distance, self.f_number = focus_distance, f_number
         self.focal_length, self.pixel_pitch, self.max_radius = focal_length, pixel_pitch, max_radius
         self.compositing, self.color_space = compositing, color_space
@@ -312,14 +338,9 @@ class RandomDepthBlur(DepthAugmentation):
     ) -> None:
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
         nearest, farthest = checked_range("focus_distance", focus_distance, "metres")
-        check_positive("focal_length", focal_length)
-        if nearest <= focal_length:
-            raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {nearest}")
-        check_choice("color_space", color_space, COLOR_SPACES)
-        check_choice("compositing", compositing, ("gather", "scatter", "occlusion"))
-        check_positive("max_radius", max_radius, "pixels")
-        check_positive("pixel_pitch", pixel_pitch)
-        ends = torch.tensor(checked_range("f_number", f_number), device="cpu")
+        fastest, slowest = checked_range("f_number", f_number)
+        _check_lens(nearest, fastest, focal_length, pixel_pitch, max_radius, compositing, color_space)
+        ends = torch.tensor([fastest, slowest], device="cpu")
         focus = torch.tensor([nearest, farthest], device="cpu")
         self._param_generator = PlainUniformGenerator(
             (focus, "focus_distance", None, None), (ends, "f_number", None, None)

@@ -57,7 +57,16 @@ class Material:
         if not shortest * (1 - slack) <= wavelength <= longest * (1 + slack):
             allowed = f"{shortest * 1e9:g} to {longest * 1e9:g} nm"
             raise ValueError(f"the index of {self.name} is published for {allowed}, got {wavelength * 1e9:g} nm")
-        return self.dispersion(wavelength * 1e6, self.terms)
+        try:
+            index = self.dispersion(wavelength * 1e6, self.terms)
+        except (ValueError, ZeroDivisionError):  # the root of a negative number, or a resonance
+            index = math.nan
+        if not 1 <= index < 5:
+            raise ValueError(
+                f"the index of {self.name} must be from 1 to 5, and its dispersion formula gives {index:.4g} at "
+                f"{wavelength * 1e9:g} nm"
+            )
+        return index
 
 
 def constant_index(index: float) -> Material:

@@ -173,7 +173,7 @@ def metres_per_unit(scale: float | None, whole: bool, kind: Any) -> float:
     if scale is None and whole:
         raise ValueError(f"a depth of {kind} needs depth_scale, metres per unit, such as 0.001 for millimetres")
     check_positive("depth_scale", 1.0 if scale is None else scale, "metres per unit")
-    return 1.0 if scale is None else scale
+    return 1.0 if scale is None else float(scale)
 
 
 def check_depth_scale(scale: float, stored: np.ndarray) -> None:

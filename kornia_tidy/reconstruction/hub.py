@@ -14,6 +14,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
+from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.reconstruction.half_precision import halved
 from kornia_tidy.reconstruction.model_card import check_license, model_card
@@ -148,7 +149,10 @@ def from_pretrained(
         options |= {"local_files_only": local_files_only, "force_download": force_download}
         config, weights = (_download(name, file, options) for file in (CONFIG, WEIGHTS))
     else:
-        raise FileNotFoundError(f"there is no folder {name}, and the name of a repository is OWNER/NAME")
+        raise FileNotFoundError(
+            f"there is no folder {name}, and the name of a repository is OWNER/NAME; shipped systems are "
+            f"{', '.join(PRETRAINED)}"
+        )
     values = read_json(config)
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         found = values.get("format") if isinstance(values, dict) else None

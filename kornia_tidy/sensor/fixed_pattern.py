@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_finite, check_float_tensor, check_number
+from kornia_tidy.checks import check_finite, check_float_tensor, check_generator, check_number, described
 
 MAPS = "(H, W) or (C, H, W) of the whole sensor, with 1 in the place of H or W where rows or columns are alike"
 
@@ -47,6 +47,10 @@ def draw_pattern(
         >>> response.unique().tolist(), bool((offset == offset[:1]).all())
         ([1.0], True)
     """
+    for name, side in (("height", height), ("width", width)):
+        if not isinstance(side, int) or side < 1:
+            raise ValueError(f"{name} must be a whole number of pixels, 1 or more, got {described(side)}")
+    check_generator(generator)
     for name, value in (("response", response), ("dark", dark), ("columns", columns)):
         check_number(name, value, "as a standard deviation")
         if not 0 <= value < (0.3 if name == "response" else float("inf")):
@@ -70,6 +74,15 @@ def check_pattern(name: str, plane: Tensor | None) -> None:
     check_finite(name, plane)
     if name == "response" and bool((plane < 0).any()):
         raise ValueError(f"response must not be negative, got {float(plane.min())}")
+    if not plane.numel():
+        raise ValueError(f"{name} must have at least one pixel, got shape {tuple(plane.shape)}")
+    if name == "response" and float(plane.mean()) > 2:
+        raise ValueError(f"response must be 1 on average, got {float(plane.mean()):.4g}: divide it by its mean")
+    if name == "offset" and float(plane.abs().max()) >= 1:
+        raise ValueError(
+            f"offset must be in units of full scale, below 1, got {float(plane.abs().max()):.4g}: divide digital "
+            f"numbers by those of full scale"
+        )
 
 
 def pattern_at(name: str, plane: Tensor, like: Tensor, origin: tuple[int, int]) -> Tensor:
@@ -82,8 +95,10 @@ def pattern_at(name: str, plane: Tensor, like: Tensor, origin: tuple[int, int]) 
         origin: row and column of the sensor at its first pixel.
 
     Raises:
-        ValueError: if the image reaches beyond the sensor.
+        ValueError: if the image reaches beyond the sensor, or has another number of channels.
     """
+    if plane.ndim == 3 and plane.shape[0] not in (1, like.shape[-3]):
+        raise ValueError(f"the sensor's {name} has {plane.shape[0]} channels, and the image {like.shape[-3]}")
     for axis, first in ((-2, origin[0]), (-1, origin[1])):
         side, needed = plane.shape[axis], like.shape[axis]
         if side == 1:

@@ -95,6 +95,7 @@ class TestSimulate(BaseTester):
         told = TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
         assert (first == kornia_tidy.simulate(image, depth, optics=told, seed=0)).all()
         assert (first == second).all()
+        assert (first == kornia_tidy.simulate(image, depth, torch.tensor(1.0), seed=np.int64(0))).all()
         assert (first != other).any()
         assert np.abs(first.astype(int) - other).max() < 0.2 * 65535  # noise of 0.01 in linear light, not other masks
 
@@ -127,6 +128,8 @@ class TestSimulate(BaseTester):
             ({"depth": np.ones((5, 4))}, ValueError, r"rows, columns and batch of the image \(4, 5, 3\), got \(5, 4\)"),
             ({"depth": np.ones((4, 5, 2, 2))}, ValueError, r"depth must have shape .*, got \(4, 5, 2, 2\)"),
             ({"depth_scale": 0.0}, ValueError, "depth_scale must be positive"),
+            ({"depth_scale": np.array([1.0, 2.0])}, TypeError, "depth_scale must be a number in metres per unit, got"),
+            ({"seed": 1.5}, TypeError, "seed must be a whole number, got the number 1.5"),
             ({"color": "BGR"}, ValueError, "color must be one of 'bgr', 'rgb', got 'BGR'"),
             ({"optics": "tidy-5"}, TypeError, "optics must be a camera such as TiDyOptics.., got 'tidy-5'"),
         ],
@@ -173,8 +176,12 @@ class TestReconstruct(BaseTester):
         assert image.shape == (32, 48, 3)
 
     def test_exception(self, head):
-        with pytest.raises(FileNotFoundError, match="there is no folder"):
+        with pytest.raises(FileNotFoundError, match=r"there is no folder joint-9, .* shipped systems are"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), "joint-9")
+        with pytest.raises(ValueError, match=r"captures must be one or more, got shape \(0, 8, 8, 3\)"):
+            kornia_tidy.reconstruct(picture("uint8", 0, 8, 8, 3), head)
+        with pytest.raises(TypeError, match="memory_budget must be a number in bytes, got '1GB'"):
+            kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), head, memory_budget="1GB")
         with pytest.raises(ValueError, match=r"image must have shape .*, got \(8, 8, 4\): drop alpha"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 4), head)
         with pytest.raises(TypeError, match="system must be a TiDyOptics, a PSFBank, a TrainedSystem"):

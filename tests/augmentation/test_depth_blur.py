@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import convolve
 
 from kornia_tidy import NoMask, TiDyOptics
-from kornia_tidy.augmentation import RandomDepthBlur, depth_blur
+from kornia_tidy.augmentation import DepthBlur, RandomDepthBlur, depth_blur
 from kornia_tidy.augmentation.depth_blur import blur_radius, disc, disc_radius
 from kornia_tidy.optics import Lens
 from tests.base import BaseTester
@@ -100,6 +100,12 @@ class TestDepthBlur(BaseTester):
             depth_blur(image, depth, 0.04, 2.0)
         with pytest.raises(ValueError, match="f_number must be positive"):
             depth_blur(image, depth, 1.0, 0.0)
+        with pytest.raises(ValueError, match=r"pixel_pitch must be metres between 1e-07 and 0.001 .*, got 8"):
+            depth_blur(image, depth, 1.0, 2.0, pixel_pitch=8)
+        with pytest.raises(ValueError, match=r"focal_length must be metres between 1e-05 and 10 .*, got 50"):
+            DepthBlur(1.0, 2.0, focal_length=50)
+        with pytest.raises(TypeError, match="focus_distance must be a number in metres, got '1'"):
+            depth_blur(image, depth, "1", 2.0)
         with pytest.raises(ValueError, match="f_number must be one number or one for each of 1 images, got 3"):
             depth_blur(image, depth, 1.0, torch.ones(3))
         with pytest.raises(ValueError, match="focus_distance must be one number or one for each of 1 images, got 0"):

@@ -44,12 +44,13 @@ class TestDrawPattern(BaseTester):
         ("options", "sentence"),
         [
             ({"response": 0.4}, "response must be a standard deviation from 0 to 0.3, got 0.4"),
+            ({"height": -1}, "height must be a whole number of pixels, 1 or more, got the number -1"),
             ({"dark": -1e-3}, "dark must be a standard deviation zero or positive and finite, got -0.001"),
         ],
     )
     def test_exception(self, options, sentence):
         with pytest.raises(ValueError, match=sentence):
-            draw_pattern(3, 3, **options)
+            draw_pattern(**{"height": 3, "width": 3, **options})
 
 
 class TestPatternedSensor(BaseTester):
@@ -100,6 +101,9 @@ class TestPatternedSensor(BaseTester):
             ({"response": torch.tensor([[-1.0]])}, ValueError, "response must not be negative, got -1.0"),
             ({"offset": torch.tensor([[float("nan")]])}, ValueError, "offset"),
             ({"offset": 0.1}, TypeError, "offset"),
+            ({"offset": torch.full((1, 1), 64.0)}, ValueError, "offset must be in units of full scale, .* got 64"),
+            ({"response": torch.full((1, 1), 2000.0)}, ValueError, "response must be 1 on average, got 2000"),
+            ({"response": torch.ones(0, 4)}, ValueError, r"response must have at least one pixel, got shape \(0, 4\)"),
         ],
     )
     def test_exception_of_maps(self, options, error, sentence):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kornia_tidy.optics.lens.prescription import Prescription, Surface
+from kornia_tidy.optics.lens.prescription import LONGEST, Prescription, Surface
 from kornia_tidy.optics.lens.rays import Array
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
@@ -64,6 +64,11 @@ def first_order(
     if not power > 0:
         raise ValueError(f"the lens must collect light, got a power of {power:g} 1/m")
     focal_length = 1 / power
+    if focal_length > LONGEST:
+        raise ValueError(
+            f"the focal length of a prescription must be at most {LONGEST:g} m, got {focal_length:.4g} m: if its "
+            f"lengths are millimetres, give it 'unit': 'mm'"
+        )
     to_stop = np.eye(2)
     if stop:
         front = _matrix(surfaces[:stop], vertices[:stop], indices[:stop])

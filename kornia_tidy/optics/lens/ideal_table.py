@@ -119,17 +119,19 @@ def read_zernike_table(
     """
     check_choice("order", order, ORDERS)
     check_choice("sign", sign, (-1, 1))
-    text = read_text(path)
+    reader = csv.reader(read_text(path).splitlines())
     try:
-        rows = [row for row in csv.reader(text.splitlines()) if row and not row[0].startswith("#")]
+        rows = [(reader.line_num, row) for row in reader if row and not row[0].startswith("#")]
     except csv.Error as error:
         raise ValueError(f"cannot read {path}: {error}") from error
-    if len(rows) < 2:
-        raise ValueError(f"{path} must have a line of names and one or more of numbers, got {len(rows)} lines")
-    names = [name.strip() for name in rows[0]]
+    if not 2 <= len(rows) <= _MOST_ROWS:
+        raise ValueError(
+            f"{path} must have a line of names and one or more of numbers, got {len(rows)} lines of 2 to {_MOST_ROWS}"
+        )
+    names = [name.strip() for name in rows[0][1]]
     terms = _terms(path, names)
     fields, waves, table = [], [], []
-    for number, row in enumerate(rows[1 : _MOST_ROWS + 1], 2):
+    for number, row in rows[1:]:
         if len(row) != len(names):
             raise ValueError(f"line {number} of {path} must have {len(names)} values, got {len(row)}")
         given = {name: _number(path, number, name, text) for name, text in zip(names, row, strict=True)}
@@ -145,7 +147,7 @@ def read_zernike_table(
             f"wavelength_nm of {path} must be from 100 to 20000, got {min(waves) * 1e9:g} to {max(waves) * 1e9:g}"
         )
     values, largest = np.array(table), max(fields)
-    _check_symmetry(path, values, terms, order)
+    _check_symmetry(path, values, np.array(fields), terms, order)
     splines = {}
     for wave in sorted(set(waves)):
         chosen = [i for i, other in enumerate(waves) if other == wave]
@@ -154,6 +156,11 @@ def read_zernike_table(
         if (np.diff(heights) <= 0).any():
             raise ValueError(
                 f"{path} must have each field once for each wavelength, got one twice at {wave * 1e9:g} nm"
+            )
+        if heights[-1] < largest or (largest and len(heights) < 2):
+            raise ValueError(
+                f"{path} must have two fields or more for each wavelength, up to the largest of {largest * 1e3:g} mm, "
+                f"got {', '.join(f'{height * 1e3:g}' for height in heights)[:80]} at {wave * 1e9:g} nm"
             )
         splines[wave] = _over_field(heights, values[chosen], terms, order)
 
@@ -173,7 +180,9 @@ def _terms(path: str | os.PathLike[str], names: list[str]) -> list[int]:
         if name in ("field_mm", "wavelength_nm"):
             continue
         digits = name.removeprefix("Z")
-        if not (name.startswith("Z") and digits.isdecimal() and 1 <= int(digits[:4]) <= _MOST_TERMS):
+        if not (
+            name.startswith("Z") and digits.isascii() and digits.isdecimal() and 1 <= int(digits[:4]) <= _MOST_TERMS
+        ):
             raise ValueError(
                 f"columns of {path} must be field_mm, wavelength_nm and Z1 to Z{_MOST_TERMS}, got {name!r:.60}"
             )
@@ -183,8 +192,10 @@ def _terms(path: str | os.PathLike[str], names: list[str]) -> list[int]:
     return terms
 
 
-def _check_symmetry(path: str | os.PathLike[str], values: np.ndarray, terms: list[int], order: str) -> None:
-    """Refuse coefficients that are not mirrored at the plane of the field, which is x = 0 in the file."""
+def _check_symmetry(
+    path: str | os.PathLike[str], values: np.ndarray, fields: np.ndarray, terms: list[int], order: str
+) -> None:
+    """Refuse coefficients that are not mirrored at the plane of the field, x = 0 in the file, or turn with it at 0."""
     for term, column in zip(terms, values.T, strict=True):
         _, m = _orders(order, term)
         odd = (m > 0 and m % 2 == 1) or (m < 0 and m % 2 == 0)  # cosines of odd, sines of even multiples
@@ -192,6 +203,12 @@ def _check_symmetry(path: str | os.PathLike[str], values: np.ndarray, terms: lis
             raise ValueError(
                 f"coefficients of {path} must be 0, as of a lens of revolution with fields along +y, got {worst:g} for "
                 f"Z{term}"
+            )
+        axis = column[fields == 0]
+        if m and axis.size and (worst := axis[np.abs(axis).argmax()]) and abs(worst) > _LEAST:
+            raise ValueError(
+                f"coefficients of {path} must be those of a lens of revolution, 0 on its axis, got {worst:g} for "
+                f"Z{term} at field_mm 0"
             )
 
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_number, described
+from kornia_tidy.checks import check_choice, check_number, check_part, described
 from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.ideal_table import read_zernike_table, seidel_wavefront
@@ -25,6 +25,7 @@ from kornia_tidy.optics.lens.made_lenses import (
     named_parts,
     traced_parts,
 )
+from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
 from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import light_through_stop
 from kornia_tidy.optics.thin_lens import ThinLensCamera
@@ -116,7 +117,12 @@ class Lens(nn.Module):
             >>> round(lens.focal_length * 1e3, 2)
             49.99
         """
-        return cls(*named_parts(name, f_number, focus_distance, tuple(wavelengths), field))
+        check_choice("name of a lens", name, tuple(NAMED_LENSES))
+        numbers = {"f_number": f_number, "focus_distance": focus_distance, "field": 0.0 if field is None else field}
+        for what, number in numbers.items():
+            check_number(what, number)
+        height = None if field is None else float(field)
+        return cls(*named_parts(name, float(f_number), float(focus_distance), checked_wavelengths(wavelengths), height))
 
     @classmethod
     def from_prescription(
@@ -353,9 +359,7 @@ class Lens(nn.Module):
             defocus: of the scene in radians.
             wavelength: in metres.
         """
-        sample = self.sample(
-            torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus]), wavelength
-        )
+        sample = self.sample(_with_axis(heights), torch.tensor([defocus]), wavelength)
         areas = light_through_stop(sample)[:, 0]
         return areas[1:] / areas[0]
 
@@ -367,10 +371,9 @@ class Lens(nn.Module):
             heights: (F,) in metres from the axis, where light of 530 nm lands.
             defocus: of the scene in radians.
         """
+        heights = _with_axis(heights)
         self.warn_if_beyond(heights, torch.tensor([defocus]), None)
-        slopes = self._table.slopes(
-            torch.cat([heights.double().new_zeros(1), heights.double()]), torch.tensor([defocus])
-        )[:, 0]
+        slopes = self._table.slopes(heights, torch.tensor([defocus]))[:, 0]
         return slopes[0] / slopes[1:] - 1
 
     @on_cpu
@@ -382,8 +385,8 @@ class Lens(nn.Module):
             wavelength: in metres.
             defocus: of the scene in radians.
         """
-        sample = self.sample(heights.double(), torch.tensor([defocus]), wavelength)
-        return heights * (sample.chief[:, 0] - 1)
+        sample = self.sample(_with_axis(heights), torch.tensor([defocus]), wavelength)
+        return heights * (sample.chief[1:, 0] - 1)
 
     def warn_if_beyond(self, heights: Tensor, defocus: Tensor, wavelength: float | None = None) -> None:
         """Give a :class:`LensRangeWarning` if the lens is not known at a height, a defocus or a wavelength.
@@ -487,6 +490,14 @@ class Lens(nn.Module):
             f"m, field to {self.field * 1e3:.3g} mm, psi {low:+.1f} to {high:+.1f}, "
             f"{', '.join(f'{w * 1e9:.0f}' for w in self.wavelengths)} nm, {self.residual:.4f} waves rms off{moved}"
         )
+
+
+def _with_axis(heights: Tensor) -> Tensor:
+    """Return heights (F,) with the axis, 0, before them, in float64."""
+    check_part("heights", heights, Tensor, "a tensor (F,) of metres from the axis")
+    if heights.ndim != 1 or not bool((heights >= 0).all()):  # True for NaN
+        raise ValueError(f"heights must be zero or positive metres from the axis, (F,), got {heights.tolist()!r:.80}")
+    return torch.cat([heights.new_zeros(1), heights]).double()
 
 
 def _state_parts(state: Tensor) -> LensParts:

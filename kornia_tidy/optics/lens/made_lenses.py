@@ -79,12 +79,13 @@ def traced_parts(
     if f_number < FASTEST:
         raise ValueError(f"f_number must be at least {FASTEST}, got {f_number}")
     check_number("focus_distance", focus_distance, "metres")
+    f_number, focus_distance = float(f_number), float(focus_distance)
     if not focus_distance > 0:
         raise ValueError(f"focus_distance must be positive metres, got {focus_distance}")
     if field is None:
         raise ValueError("field must be the largest height on the sensor in metres, got None")
     _check_field(field)
-    system = first_order(prescription, float(f_number), float(focus_distance))
+    system = first_order(prescription, f_number, focus_distance)
     scale = math.pi * system.pupil_radius**2 / REFERENCE_WAVELENGTH
     low = -scale / focus_distance
     high = max(WIDEST, -low)
@@ -96,8 +97,8 @@ def traced_parts(
         prescription.name,
         prescription.source,
         system.focal_length,
-        float(f_number),
-        float(focus_distance),
+        f_number,
+        focus_distance,
         fit.table,
         fit.residual,
     )

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from kornia_tidy.checks import check_choice, check_positive, described
+from kornia_tidy.checks import check_choice, check_number, check_positive, described
 from kornia_tidy.optics.materials import DISPERSIONS, Material, cauchy_through, constant_index
 
 UNITS = {"m": 1.0, "mm": 1e-3}
@@ -145,6 +145,7 @@ class Prescription:
 
 def half_diagonal(prescription: Mapping[str, Any]) -> float | None:
     """Return half the diagonal of the sensor that a prescription names, in metres."""
+    _mapping("prescription", prescription)
     sensor, pitch = prescription.get("sensor"), prescription.get("pitch_um")
     if sensor is None or pitch is None:
         return None
@@ -258,8 +259,9 @@ def _index(what: str, value: Any) -> float:
 
 
 def _number(what: str, value: Any, *, nonzero: bool = False) -> float:
-    if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
-        raise TypeError(f"{what} must be a number, got {described(value)}")
+    if isinstance(value, bool):
+        raise TypeError(f"{what} must be a number, got {value}")
+    check_number(what, value)
     number = float(value)
     if not math.isfinite(number) or (nonzero and number == 0):
         raise ValueError(f"{what} must be finite{' and not 0' if nonzero else ''}, got {number}")

@@ -23,6 +23,7 @@ from tests.base import BaseTester, shared
 from tests.optics.lens.lenses import INDEX, plano_convex, plano_hyperbolic, symmetric_pair
 
 GREEN = 530e-9
+SEIDEL = Lens.from_seidel(50e-3, 8.0, 1.0, 10e-3)
 
 
 def system(prescription: dict, f_number: float, focus: float):
@@ -233,7 +234,11 @@ class TestLens(BaseTester):
     def test_feature_zernike_tables_in_both_orders(self, tmp_path, order, columns, function):
         """Noll (1976), table I; fringe: Wyant and Creath (1992), table III. Their x and y are the file's."""
         lines = [f"field_mm,wavelength_nm,{','.join(columns)}"]
-        lines += [f"{h},{w},{','.join(map(str, columns.values()))}" for h in (0, 5, 10) for w in (500, 600)]
+        lines += [
+            f"{h},{w},{','.join(str(value * h / 10) for value in columns.values())}"
+            for h in (0, 5, 10)
+            for w in (500, 600)
+        ]
         (tmp_path / "lens.csv").write_text("# a comment\n" + "\n".join(lines))
         lens = Lens.from_zernike_table(tmp_path / "lens.csv", 50e-3, 8.0, 1.0, order=order, sign=1)
         u, v = torch.tensor([0.3, -0.7]).double(), torch.tensor([0.5, 0.1]).double()
@@ -253,12 +258,18 @@ class TestLens(BaseTester):
             ("field_mm,Z4\n1,blue\n", "Z4 in line 2 of .* must be a finite number, got 'blue'"),
             ("field_mm,Z4\n1,1\n1,2\n", "must have each field once for each wavelength"),
             ("field_mm,Z8\n1,1\n", "must be 0, as of a lens of revolution with fields along .y, got 1 for Z8"),
+            ("# a\n\nfield_mm,Z4\n1,blue\n", "Z4 in line 4 of .* must be a finite number, got 'blue'"),
+            ("field_mm,Z\uff14\n1,1\n", "must be field_mm, wavelength_nm and Z1 to Z91, got 'Z\uff14'"),
+            ("field_mm,Z4\n" + "0,1\n" * 20_000, "got 20001 lines of 2 to 20000"),
+            ("field_mm,Z7\n0,0.2\n1,0.3\n", "0 on its axis, got 0.2 for Z7 at field_mm 0"),
+            ("field_mm,Z4\n5,1\n", "must have two fields or more for each wavelength, .* got 5 at 530 nm"),
+            ("field_mm,wavelength_nm,Z4\n0,470,1\n5,470,1\n0,610,1\n3,610,1\n", "largest of 5 mm, got 0, 3 at 610 nm"),
             ("field_mm,Z4\n-1,1\n", "field_mm of .* must be from 0 to 1000, got -1"),
             ("field_mm,wavelength_nm,Z4\n1,0.53,1\n", "wavelength_nm of .* must be from 100 to 20000, got 0.53"),
         ],
     )
     def test_exception_zernike_tables(self, tmp_path, text, message):
-        (tmp_path / "lens.csv").write_text(text)
+        (tmp_path / "lens.csv").write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=message) as raised:
             Lens.from_zernike_table(tmp_path / "lens.csv", 50e-3, 8.0, 1.0)
         assert "\n" not in str(raised.value)
@@ -313,6 +324,13 @@ class TestLens(BaseTester):
                 lambda: Lens.from_prescription(plano_convex(), 8.0, 0.5),
                 "field must be the largest height on the sensor",
             ),
+            (
+                lambda: Lens.from_prescription(plano_convex(25.0), 8.0, 0.5, field=0),
+                "millimetres, give it 'unit': 'mm'",
+            ),
+            (lambda: Lens.from_prescription(plano_convex(index={"powers": [[-2, 0]]}), 8.0, 0.5, field=0), "gives nan"),
+            (lambda: SEIDEL.distortion(torch.tensor([-1e-3])), "heights must be zero or positive metres .*-0.001"),
+            (lambda: SEIDEL.relative_illumination(torch.zeros(2, 2)), "heights must be zero or positive metres"),
             (lambda: Lens.from_prescription(plano_convex(-25e-3), 8.0, 0.5, field=0), "the lens must collect light"),
             (
                 lambda: Lens.from_seidel(50e-3, 8.0, 1.0, 1e-2, coma=math.nan),
@@ -325,6 +343,20 @@ class TestLens(BaseTester):
         with pytest.raises(ValueError, match=message) as raised:
             call()
         assert "\n" not in str(raised.value)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda: Lens.named("single-50mm", [8], 0.5), "f_number must be a number, got a list"),
+            (lambda: Lens.named("single-50mm", 8, 0.5, wavelengths=530e-9), "wavelengths must be one or more numbers"),
+            (lambda: Lens.from_prescription(5, 8.0, 0.5), "prescription must be a mapping, got the number 5"),
+            (lambda: Lens.from_seidel(50e-3, 8.0, 1.0, 1e-2, coma=np.ones(2)), "coma must be a number, got a ndarray"),
+            (lambda: SEIDEL.lateral_colour(1e-3, 530e-9), "heights must be a tensor .*, got the number 0.001"),
+        ],
+    )
+    def test_exception_of_types(self, call, message):
+        with pytest.raises(TypeError, match=message):
+            call()
 
     def test_exception_files_that_are_no_lens(self, tmp_path):
         from safetensors.torch import save_file
