@@ -22,7 +22,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.scattered_transform import scattered_energies, scattered_grid
 
-_LONGEST = 5.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
+_LONGEST = 8.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
 _BEYOND = 1.5  # times the lens's range; PSFs within it may be interpolated
 _GRID = 21  # points along the stop at which the steepest phase is looked for
 _HEIGHTS = 5  # in the lens's field, where it is looked for
@@ -196,10 +196,7 @@ def lens_limits(lens: Lens, defocus: Sequence[float], wavelength: float) -> Limi
     seen = turned_lenses(lens, places, [times * end for end in reach], wavelength)
     polynomials, inside = _stop_grid(seen[0].degree)
     basis, stop = polynomials.flatten(1), polynomials.shape[1:]
-    turns = _rows(seen, 1.0, 0.0)
-    phases = turns[:, 2 : 2 + seen[0].phase_terms.shape[1]]
-    phase = (2 * math.pi * seen[0].phase_terms @ phases @ basis).unflatten(-1, stop)  # (places, 2, rows, columns)
-    cosines = (turns[:, :2] @ basis).unflatten(-1, stop)
+    phase, cosines = (part.unflatten(-1, stop) for part in wavefronts(seen, basis))  # (places, 2, rows, columns)
     slopes, per_radius = [], (_GRID - 1) / 2
     for axis in (0, 1):
         valid = inside.narrow(axis, 1, _GRID - 1) & inside.narrow(axis, 0, _GRID - 1)
@@ -207,6 +204,18 @@ def lens_limits(lens: Lens, defocus: Sequence[float], wavelength: float) -> Limi
         steepest, spread = (part.amax(2) for part in steps)  # (places, 2) each: at either end, along y and x
         slopes += zip(steepest.amax(1).tolist(), spread.sum(1).tolist(), strict=True)
     return Limits(tuple(slopes), float(cosines[..., inside].abs().max()) * _MARGIN)
+
+
+def wavefronts(turned: Sequence[TurnedLens], polynomials: Tensor) -> tuple[Tensor, Tensor]:
+    """Return wavefronts in radians at the wavelength, (F, D, S), and direction cosines along y and x, (F, 2, S).
+
+    Args:
+        turned: a lens at F field points and D depths.
+        polynomials: values at S points of the stop, (J, S), or at those of each field point, (F, J, S).
+    """
+    rows, terms = _rows(turned, 1.0, 0.0), turned[0].phase_terms
+    phases = rows[:, 2 : 2 + terms.shape[1]]
+    return 2 * math.pi * terms @ phases @ polynomials, rows[:, :2] @ polynomials
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,10 +400,9 @@ class TurnedLens:
 
     def phase(self, polynomials: Tensor) -> Tensor:
         """Return the wavefront in radians at the wavelength, (J, ...) to (D, ...)."""
-        rows = _rows([self], 1.0, 0.0)[0, 2 : 2 + self.phase_terms.shape[1]]
-        return 2 * math.pi * torch.tensordot(self.phase_terms @ rows, polynomials, 1)
+        return wavefronts([self], polynomials.flatten(1))[0][0].unflatten(-1, polynomials.shape[1:])
 
     def frequencies(self, polynomials: Tensor) -> tuple[Tensor, Tensor]:
         """Return the direction cosines along x and y in which light arrives, less the chief ray's."""
-        y, x = torch.tensordot(_rows([self], 1.0, 0.0)[0, :2], polynomials, 1)
+        y, x = wavefronts([self], polynomials.flatten(1))[1][0].unflatten(-1, polynomials.shape[1:])
         return x, y

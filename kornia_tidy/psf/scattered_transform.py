@@ -25,8 +25,9 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.scattered_ops import SOURCE, Points, Transform, scattered_light, scattered_light_by_torch
 from kornia_tidy.mode import Mode, torch_mode
 
-_SIGMA = 1.4  # period of the transform over the window: light beyond it folds back outside the used part
-_DENSITY = 1.35  # samples of the intensity over those that its bandwidth needs
+_SIGMA = 1.25  # period of the transform over the window: light beyond it folds back outside the used part
+_DENSITY = 1.15  # samples of the intensity over those that its bandwidth needs
+_DIM = 0.2  # power of the tolerance
 _NODES = 96
 _STEP = 0.25  # pixels in which the largest shift is counted
 
@@ -93,7 +94,8 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
     span = max(2 * highest, 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH))
     decay = 1 - 0.85 * math.log(tolerance)  # a pixel attenuates the spectrum's images too
-    reach = math.ceil(math.hypot(decay, math.pi) / (math.pi * (1 - 1 / _DENSITY)))
+    lit = 1 - tolerance**_DIM  # of the bandwidth: little light is at the highest frequencies, as overlaps of the stop
+    reach = math.ceil(math.hypot(decay, math.pi) / (math.pi * (1 - lit / _DENSITY)))
     spacing = 1 / (2 * _DENSITY * span)
     half = math.ceil((window / 2 + math.ceil(shift / _STEP) * _STEP) / spacing) + reach
     step = 1 / (2 * _SIGMA * half * spacing)
