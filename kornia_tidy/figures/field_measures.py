@@ -152,7 +152,7 @@ def _rays(
     pitch, metres = optics.camera.pixel_pitch, [(0.0, height) for height in heights]
     shares = torch.tensor(optics.spectrum.channel_weights, dtype=torch.float64)
     waves = (shares @ torch.tensor(optics.spectrum.wavelengths, dtype=torch.float64)).tolist()
-    seen = [turned_lenses(lens, metres, psi, wave) for wave in waves]
+    seen = [turned_lenses(lens.table, metres, psi, wave) for wave in waves]
     rays = tuple(
         tuple(ray_errors(turned, *rays_in_stop(turned)) / pitch for turned in row) for row in zip(*seen, strict=True)
     )

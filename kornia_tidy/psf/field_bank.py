@@ -294,12 +294,13 @@ def field_psf_bank(
     apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
     metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
-    whole = there = phase.new_zeros(())
+    planes: list[list[Tensor]] = [[] for _ in spectrum.plane_weights]
+    lights: list[list[Tensor]] = [[] for _ in spectrum.plane_weights]
     for w, wavelength in enumerate(spectrum.wavelengths):
-        seen, mixing = _mixing(spectrum, w, phase)
+        seen, mixing = _mixing(spectrum, w)
         if not seen:
             continue
-        axis, *turned = turned_lenses(lens, metres, defocus, wavelength)
+        axis, *turned = turned_lenses(lens.table, metres, defocus, wavelength)
         on_axis = lens_light(whole_cells(pupil), pupil.transmission, [axis], sensor.tolerance).to(weights)[0]
         if not bool((on_axis > 0).all()):  # False for NaN too
             raise ValueError(
@@ -309,10 +310,10 @@ def field_psf_bank(
         limits = lens_limits(lens, defocus, wavelength)
         energies, area = lens_psfs(screens[w], weights, pupil.transmission, turned, limits, sensor, apart[:, w, seen])
         share = area / on_axis
-        lit = share[..., None, None, None] * energies
-        for v, weights_of_planes in enumerate(mixing.T):  # no matrix product: its order follows the number of depths
-            whole = whole + weights_of_planes[:, None, None] * lit[:, :, v, None]
-            there = there + share[..., None] * weights_of_planes
+        for plane, v, weight in mixing:
+            lights[plane].append(weight * share)
+            planes[plane].append(lights[plane][-1][..., None, None] * energies[:, :, v])
+    whole, there = (torch.stack([sum(own[1:], own[0]) for own in parts], 2) for parts in (planes, lights))
     energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
     points = phase.new_tensor([list(point) for point in field])
     return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
@@ -353,7 +354,7 @@ def field_light(
     spans, found = whole_cells(pupil), []
     metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
     for wavelength in spectrum.wavelengths:
-        turned = turned_lenses(lens, metres, defocus, wavelength)
+        turned = turned_lenses(lens.table, metres, defocus, wavelength)
         areas = lens_light(spans, pupil.transmission, turned)
         found.append(areas[1:] / areas[0])
     return torch.stack(found, -1) @ areas.new_tensor(spectrum.channel_weights).T
@@ -367,17 +368,16 @@ def light_on_axis(pupil: Pupil, amplitude: Tensor, lens: Lens) -> Tensor:
         amplitude: (K, n, n).
         lens: in front of the sensor.
     """
-    spans, axis = whole_cells(pupil), turned_lenses(lens, [(0.0, 0.0)], [0.0], REFERENCE_WAVELENGTH)
+    spans, axis = whole_cells(pupil), turned_lenses(lens.table, [(0.0, 0.0)], [0.0], REFERENCE_WAVELENGTH)
     return torch.stack([lens_light(spans, own.double().cpu().square(), axis)[0, 0] for own in amplitude])
 
 
-def _mixing(spectrum: Spectrum, wave: int, like: Tensor) -> tuple[list[int], Tensor]:
-    """Return the channels that see a wavelength, and its weight in each plane by channel, (planes, channels seen)."""
+def _mixing(spectrum: Spectrum, wave: int) -> tuple[list[int], list[tuple[int, int, float]]]:
+    """Return the channels that see a wavelength, and of their planes each number, channel among these, and weight."""
     planes = [row[wave] for row in spectrum.plane_weights]
     basis = len(planes) // len(spectrum.weights)
     seen = [channel for channel, row in enumerate(spectrum.channel_weights) if row[wave]]
-    rows = [[weight if plane // basis == channel else 0.0 for channel in seen] for plane, weight in enumerate(planes)]
-    return seen, like.new_tensor(rows)
+    return seen, [(n, v, planes[n]) for v, own in enumerate(seen) for n in range(own * basis, (own + 1) * basis)]
 
 
 def whole_cells(pupil: Pupil) -> Tensor:

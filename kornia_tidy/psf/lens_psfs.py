@@ -15,7 +15,7 @@ from kornia_tidy.kernels.scattered_ops import Points
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.field_table import defocus_terms
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.lens.lens_table import degree_of, modes_of
+from kornia_tidy.optics.lens.lens_table import LensTable, degree_of, modes_of
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrature
 from kornia_tidy.optics.quadrature import gauss_legendre_order
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -152,12 +152,12 @@ def lens_light(spans: Tensor, transmission: Tensor, turned: Sequence[TurnedLens]
 
 @on_cpu
 def turned_lenses(
-    lens: Lens, field: Sequence[tuple[float, float]], defocus: Sequence[float], wavelength: float
+    table: LensTable, field: Sequence[tuple[float, float]], defocus: Sequence[float], wavelength: float
 ) -> list[TurnedLens]:
     """Return a lens with the view from points of the field.
 
     Args:
-        lens: in front of the sensor.
+        table: of the lens in front of the sensor.
         field: places (y, x) on the sensor in metres from the axis.
         defocus: radians at 530 nm, (D,).
         wavelength: in metres.
@@ -167,14 +167,12 @@ def turned_lenses(
     """
     psi = torch.tensor(defocus, dtype=torch.float64)
     heights, azimuths = torch.tensor([(math.hypot(*p), math.atan2(*p)) for p in field], dtype=torch.float64).T
-    series = lens.table.series(heights, wavelength)
+    series = table.series(heights, wavelength)
     parts = {name: getattr(series, name) for name in _PARTS}
     degree = max(2, *(degree_of(part.shape[-1], sines=name in _SINES) for name, part in parts.items()))
     turned = {name: _turned(part, azimuths, degree, sines=name in _SINES) for name, part in parts.items()}
-    shifts = [(y * lens.table.mask_shift, x * lens.table.mask_shift) for y, x in field]
-    terms = {
-        name: defocus_terms(psi, lens.table.reach, part.shape[1]) for name, part in parts.items() if part.ndim == 3
-    }
+    shifts = [(y * table.mask_shift, x * table.mask_shift) for y, x in field]
+    terms = {name: defocus_terms(psi, table.reach, part.shape[1]) for name, part in parts.items() if part.ndim == 3}
     places = zip(series.edges, azimuths.tolist(), shifts, strict=True)
     return [
         TurnedLens({name: part[i] for name, part in turned.items()}, terms, degree, *place, psi, wavelength)
@@ -189,11 +187,16 @@ def lens_limits(lens: Lens, defocus: Sequence[float], wavelength: float) -> Limi
     As its whole field and range of defocus ask, or a multiple of the range: so that PSFs are as fine whatever they are
     computed with.
     """
-    reach = lens.table.reach
-    times = max(1, math.ceil(max(map(abs, defocus)) / (_BEYOND * max(map(abs, reach)) or 1.0)))
-    heights = np.linspace(0, float(lens.table.field[0]), _HEIGHTS)
+    reach = max(map(abs, lens.table.reach))
+    return _limits(lens.table, max(1, math.ceil(max(map(abs, defocus)) / (_BEYOND * reach or 1.0))), wavelength)
+
+
+@lru_cache(maxsize=32)
+def _limits(table: LensTable, times: int, wavelength: float) -> Limits:
+    """Return the limits within a multiple of the lens's range of defocus."""
+    heights = np.linspace(0, float(table.field[0]), _HEIGHTS)
     places = [(h * math.sin(a), h * math.cos(a)) for h in heights.tolist() for a in (0.0, math.pi / 4)]
-    seen = turned_lenses(lens, places, [times * end for end in reach], wavelength)
+    seen = turned_lenses(table, places, [times * end for end in table.reach], wavelength)
     polynomials, inside = _stop_grid(seen[0].degree)
     basis, stop = polynomials.flatten(1), polynomials.shape[1:]
     phase, cosines = (part.unflatten(-1, stop) for part in wavefronts(seen, basis))  # (places, 2, rows, columns)

@@ -38,7 +38,7 @@ def ray_errors(turned: TurnedLens, y: Tensor, x: Tensor) -> Tensor:
         >>> from kornia_tidy.optics import Lens
         >>> from kornia_tidy.psf.lens_psfs import turned_lenses
         >>> lens, edge = Lens.from_seidel(50e-3, 5.0, float("inf"), 10e-3), torch.tensor([1.0])
-        >>> (turned,) = turned_lenses(lens, [(0.0, 0.0)], [10.0], 530e-9)
+        >>> (turned,) = turned_lenses(lens.table, [(0.0, 0.0)], [10.0], 530e-9)
         >>> errors = ray_errors(turned, edge, 0 * edge)  # psi 530 nm / pi, over the cone's 1 / 10
         >>> [round(1e6 * error, 2) for error in errors[0, 0].tolist()]
         [16.87, 0.0]
@@ -57,7 +57,7 @@ def rays_in_stop(turned: TurnedLens, rings: int = 8) -> tuple[Tensor, Tensor]:
     Example:
         >>> from kornia_tidy.optics import Lens
         >>> from kornia_tidy.psf.lens_psfs import turned_lenses
-        >>> (turned,) = turned_lenses(Lens.from_seidel(50e-3, 5.0, 1.0, 10e-3), [(0.0, 0.0)], [0.0], 530e-9)
+        >>> (turned,) = turned_lenses(Lens.from_seidel(50e-3, 5.0, 1.0, 10e-3).table, [(0.0, 0.0)], [0.0], 530e-9)
         >>> len(rays_in_stop(turned, 3)[0])
         37
     """

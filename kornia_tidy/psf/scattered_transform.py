@@ -89,7 +89,7 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
     Example:
         >>> grid = scattered_grid(0.3, 9, 1e-3)
         >>> grid.extent, 2 * len(grid.cosines), grid.sums(9, torch.zeros(2, 1)).shape
-        (24, 36, torch.Size([2, 1, 9, 36]))
+        (22, 28, torch.Size([2, 1, 9, 28]))
     """
     span = max(2 * highest, 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH))

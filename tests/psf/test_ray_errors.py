@@ -44,7 +44,7 @@ class TestRayErrors(BaseTester):
     def test_feature_rays_of_a_single_element_land_where_they_are_traced(self, psi, slope):
         points, seen = landed(Prescription.read(plano_convex()), 10.0, psi, slope, 60)
         lens = Lens.from_prescription(plano_convex(), 10.0, FOCUS, wavelengths=(GREEN,), field=8e-3)
-        (turned,) = turned_lenses(lens, [(0.0, float(seen[0, 0]))], [psi], GREEN)
+        (turned,) = turned_lenses(lens.table, [(0.0, float(seen[0, 0]))], [psi], GREEN)
         x, y = torch.from_numpy(points).T
         found = ray_errors(turned, y, x)[0].flip(-1)
         expected = torch.from_numpy(seen - seen[0])
@@ -56,7 +56,7 @@ class TestRayErrors(BaseTester):
         prescription = Prescription.read(NAMED_LENSES["double-gauss-50mm"]["prescription"])
         points, seen = landed(prescription, 4.0, 10.0, 0.0, 60)
         lens = Lens.named("double-gauss-50mm", 4.0, FOCUS, wavelengths=(GREEN,), field=5e-3)
-        (turned,) = turned_lenses(lens, [(0.0, 0.0)], [10.0], GREEN)
+        (turned,) = turned_lenses(lens.table, [(0.0, 0.0)], [10.0], GREEN)
         x, y = torch.from_numpy(points).T
         errors = torch.from_numpy(seen - seen[0])
         bound = 2 * float(errors.abs().max()) ** 2 / 30e-3 + 2e-8
@@ -65,19 +65,19 @@ class TestRayErrors(BaseTester):
     def test_feature_defocus_and_field_turn_with_the_field_point(self):
         lens = Lens.from_seidel(50e-3, 5.0, math.inf, 10e-3, coma=3.0, astigmatism=2.0)
         y, x = torch.tensor([0.3, -0.8, 0.5]), torch.tensor([0.7, 0.1, -0.5])
-        right, down = turned_lenses(lens, [(0.0, 6e-3), (6e-3, 0.0)], [0.0, 5.0], GREEN)
+        right, down = turned_lenses(lens.table, [(0.0, 6e-3), (6e-3, 0.0)], [0.0, 5.0], GREEN)
         self.assert_close(ray_errors(right, y, x), ray_errors(down, x, y).flip(-1), rtol=1e-6, atol=1e-12)
 
     def test_feature_coma_is_the_seidel_sum(self):
         """W131 h rho^3 cos(phi): at the top of the pupil three times the error of its side, in the same direction."""
         lens = Lens.from_seidel(50e-3, 5.0, math.inf, 10e-3, coma=3.0)
-        (turned,) = turned_lenses(lens, [(0.0, 10e-3)], [0.0], GREEN)
+        (turned,) = turned_lenses(lens.table, [(0.0, 10e-3)], [0.0], GREEN)
         errors = ray_errors(turned, torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0]))[0, :, 1]
         assert float(errors[0] / errors[1]) == pytest.approx(3, rel=0.05)  # the cone of rays is oblique by 0.2
         assert float(errors[1]) == pytest.approx(3 * GREEN * 10, rel=0.05)
 
     def test_feature_rims_take_rays_away(self):
         lens = Lens.named("double-gauss-50mm", 1.8, 5.0, wavelengths=(GREEN,), field=20e-3)
-        axis, corner = turned_lenses(lens, [(0.0, 0.0), (0.0, 20e-3)], [0.0], GREEN)
+        axis, corner = turned_lenses(lens.table, [(0.0, 0.0), (0.0, 20e-3)], [0.0], GREEN)
         assert len(rays_in_stop(axis)[0]) == 217
         assert len(rays_in_stop(corner)[0]) < 150

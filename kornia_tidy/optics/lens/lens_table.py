@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, lru_cache
 from typing import cast
 
 import torch
@@ -58,6 +58,7 @@ class LensTable:
         """Return all parts by their names."""
         return {part.name: getattr(self, part.name) for part in fields(self) if part.name != "mask_shift"}
 
+    @lru_cache(maxsize=16)  # noqa: B019 (so that cameras with the same lens share what is remembered)
     def rounded(self) -> LensTable:
         """Return the table as files hold it: in float32, but for :data:`EXACT`."""
         parts = self.tensors().items()
