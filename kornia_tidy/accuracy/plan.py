@@ -15,8 +15,8 @@ from kornia_tidy.checks import check_positive
 from kornia_tidy.psf.psf_cache import nodes_around
 
 OF_FIELD = 0.3  # of the tolerance, for PSFs between places of the field
-# Root mean square error over that of the light, for a field_tolerance of one; measured .001 to .034, with gather, scatter
-# and occlusion, noise and leaves, five masks, one and none, at the corner of a single element.
+# Root mean square error over that of the light, for a field_tolerance of one; measured .001 to .034, with gather,
+# scatter and occlusion, noise and leaves, five masks, one and none, at the corner of a single element.
 FIELD_ERROR = 0.035
 LEAST_TOLERANCE, MOST_TOLERANCE = 1e-3, 0.3  # of the field
 
