@@ -14,15 +14,15 @@ from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from tests.base import BaseTester
 from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
-from tests.benchmarks.results.captures import FIXED, PHYSICAL, sensor_of
+from tests.benchmarks.results.captures import sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
-from tests.benchmarks.results.restorations import ENSEMBLE, NETWORK, restorations_for
+from tests.benchmarks.results.restorations import restorations_for
 from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
 from tests.benchmarks.results.scores import depth_scores, local_contrast
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
 from tests.benchmarks.results.systems import available
 from tests.benchmarks.results.table import Key, Results, paired
-from tests.benchmarks.results.verdicts import FIVE, JOINT, ONE, REAL, verdicts
+from tests.benchmarks.results.verdicts import FIVE, REAL
 from tests.scenes import halves
 
 HERE = Provenance("2026-11-22", "0000000", "a test")
@@ -148,50 +148,6 @@ class TestResults(BaseTester):
         assert {key.restoration for key in synthetic(scores, [scenes]).rows} == {"capture"}
         scores[("0.01", FIVE, "capture:weight 2")] = candidates  # better on half A, not scored yet
         assert not synthetic(scores, [scenes]).rows
-
-    def test_feature_verdicts_follow_from_the_scores(self):
-        scenes = real_like()
-        scores = {}
-        for noise, loss in zip(FIXED, (0.2, 0.5, 0.1), strict=True):
-            scores |= {
-                (noise, FIVE, TIKHONOV): scored(scenes, 25.0, 0.1),
-                (noise, FIVE, NETWORK): scored(scenes, 28.0),
-                (noise, ONE, NETWORK): scored(scenes, 27.5),
-                (noise, f"{FIVE} as trained", NETWORK): scored(scenes, 29.0),
-                (noise, FIVE, f"{NETWORK}, noise x 2"): scored(scenes, 28.0 - loss),
-                (noise, FIVE, ENSEMBLE): scored(scenes, 28.6),
-            }
-        for noise, gain in zip(PHYSICAL, (2.0, 0.1, -1.0, -2.0), strict=True):
-            scores |= {
-                (noise, FLAT, NETWORK): scored(scenes, 26.0),
-                (noise, FIVE, NETWORK): scored(scenes, 26.0 + gain),
-                (noise, FLAT, ENSEMBLE): scored(scenes, 26.0),
-                (noise, FIVE, ENSEMBLE): scored(scenes, 26.5 + gain),
-            }
-        sure = scored(scenes, 26.0)
-        for name in scenes.names:
-            sure[name] |= {"depth_textured": 0.12, "depth_surest": 0.104}
-        scores[(FIXED[0], JOINT, NETWORK)] = sure
-        scores[(FIXED[0], JOINT, ENSEMBLE)] = {name: {**sure[name], "depth_surest": 0.098} for name in sure}
-        found = {row.claim: row for row in verdicts(synthetic(scores, [scenes]))}
-        surest = found[f"{JOINT}, noise 0.002: network, depth RMSE over the 70 % of each scene that it is surest of"]
-        assert (surest.measured, surest.met) == ("0.104", False)
-        surest = found[f"{JOINT}, noise 0.002: {ENSEMBLE}, depth RMSE over the 70 % of each scene that it is surest of"]
-        assert (surest.measured, surest.met) == ("0.098", True)
-        met = {claim: row.met for claim, row in found.items()}
-        assert all(met[f"{FIVE}, noise {noise}: {ENSEMBLE} over {TIKHONOV}"] for noise in FIXED)
-        assert found[f"57,000 electrons, in 8 orientations: {FIVE} over {FLAT}"].measured.startswith("+2.50 ± 0.00")
-        assert [met[f"{FIVE}, noise {noise}: network over {TIKHONOV}"] for noise in FIXED] == [True, True, False]
-        assert found[f"{FIVE}: network ahead of its best closed form"].measured == "9 of 9 scenes and noises"
-        assert met[f"noise 0.002: network of {FIVE} over that of {ONE}"] is False
-        stray = found[f"{FIVE}, noise 0.002: {NETWORK}, all light over the window as trained"]
-        assert (stray.measured, stray.met) == ("-1.00 ± 0.00 (0 of 3 scenes)", None)
-        worst = found["largest loss of a network by half or twice the noise level"]
-        assert (worst.measured, worst.met) == (f"+0.50 ± 0.00: {FIVE}, noise 0.01, noise level x 2", False)
-        assert met[f"57,000 electrons, networks: {FIVE} over {FLAT}"] is True
-        assert met[f"10,000 electrons, networks: {FIVE} over {FLAT}"] is False
-        assert found[f"500 electrons, networks: {FIVE} over {FLAT}"].measured.startswith("-2.00 ± 0.00 (0 of 3")
-        assert met["57,000 electrons, closed forms: coded over flat"] is None
 
 
 class TestStore(BaseTester):

@@ -13,26 +13,6 @@ import pytest
 from kornia_tidy.search_path import find_program, import_installed
 from tests.base import BaseTester
 
-WORKERS = """
-import multiprocessing, os
-from kornia_tidy.{imported}
-if __name__ == "__main__":
-    multiprocessing.set_start_method({method!r})
-    os.chdir({folder!r})
-    {work}
-    print("done")
-"""
-WORK = {
-    "training": (
-        "training.scenes import SceneLoader; from kornia_tidy.data.dead_leaves import DeadLeaves",
-        "assert len(list(SceneLoader(DeadLeaves(4, 32, 32), batch=2, workers=1))) == 2",
-    ),
-    "rendering": (
-        "coded_datasets.render_scenes import _rendered; from torch.utils.data import TensorDataset",
-        "assert len(list(_rendered([{}, {}], [0, 1], 2))) == 2",
-    ),
-}
-
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -54,17 +34,6 @@ def executed(folder):
 
 
 class TestSearchPath(BaseTester):
-    @pytest.mark.slow
-    @pytest.mark.parametrize("work", WORK)
-    @pytest.mark.parametrize("method", ["spawn", "forkserver"])
-    def test_feature_workers_start_without_the_current_folder(self, method, work, folder):
-        imported, line = WORK[work]
-        script = WORKERS.format(imported=imported, method=method, folder=str(folder), work=line)
-        options = {"cwd": folder.parent, "capture_output": True, "text": True}
-        done = subprocess.run([sys.executable, "-c", script], check=False, **options)
-        assert done.stdout == "done\n", done.stderr
-        assert executed(folder) == ""
-
     @pytest.mark.takes_seconds
     @pytest.mark.skipif(find_spec("h5py") is None, reason="h5py is not installed")
     def test_feature_a_reader_imports_its_package_from_where_it_is_installed(self, folder):

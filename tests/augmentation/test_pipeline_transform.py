@@ -54,11 +54,6 @@ class TestPipelineTransform(BaseTester):
             expected = torch.stack([item[name] for item in items]).flip(0)
             assert torch.equal(entries(load(workers, context), "seeded", name), expected)
 
-    @pytest.mark.slow
-    def test_feature_workers_of_one_seed_draw_the_same_by_fork_and_by_spawn(self):
-        forked, spawned = (load(2, context) for context in ("fork", "spawn"))
-        assert torch.equal(*(entries(batches, "unseeded", "image") for batches in (forked, spawned)))
-
     @pytest.mark.parametrize(("workers", "context"), LOADERS)
     def test_feature_nothing_carries_gradients(self, workers, context):
         assert not entries(load(workers, context), "unseeded", "image").requires_grad

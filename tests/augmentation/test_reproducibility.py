@@ -8,14 +8,12 @@ from __future__ import annotations
 import copy
 import pickle
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import kornia.augmentation as K
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
 
 from kornia_tidy.augmentation import RandomDepthBlur, RandomSensorNoise, RandomTiDyOptics, bound_depth
 from tests.base import BaseTester
@@ -161,46 +159,3 @@ class TestProbability(BaseTester):
             AUGMENTATIONS[name](p=p)
         with pytest.raises(TypeError, match="p must be a number"):
             AUGMENTATIONS[name](p="often")
-
-
-class Augmented(Dataset):
-    """Scenes, each changed by every augmentation inside the data set."""
-
-    def __init__(self) -> None:
-        self.augmentations = {name: make(p=0.7, keepdim=True) for name, make in AUGMENTATIONS.items()}
-
-    def __len__(self) -> int:
-        return BATCH
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        image, depth = (x[0] for x in scene(1, seed=index))
-        return {
-            name: augmentation(image, *([depth] if needs_depth(augmentation) else []))
-            for name, augmentation in self.augmentations.items()
-        }
-
-
-@lru_cache
-def loaded(workers: int, context: str | None, seed: int = 5, time: int = 0) -> dict[str, Tensor]:
-    torch.manual_seed(11)
-    data = Augmented()
-    torch.manual_seed(seed)
-    loader = DataLoader(
-        data, batch_size=2, num_workers=workers, multiprocessing_context=context, timeout=120 * bool(workers)
-    )
-    batches = list(loader)
-    return {name: torch.cat([batch[name] for batch in batches]) for name in AUGMENTATIONS}
-
-
-@pytest.mark.parametrize("name", AUGMENTATIONS)
-class TestInWorkers(BaseTester):
-    @pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork")])
-    def test_feature_one_seed_one_result(self, name, workers, context):
-        first, again, other = (loaded(workers, context, seed, time)[name] for seed, time in ((5, 0), (5, 1), (6, 0)))
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
-        assert first.requires_grad == (not workers and name == "RandomTiDyOptics")
-
-    @pytest.mark.slow
-    def test_feature_by_spawn_as_by_fork(self, name):
-        assert torch.equal(loaded(2, "spawn")[name], loaded(2, "fork")[name])

@@ -6,7 +6,6 @@ import re
 import shutil
 import struct
 import subprocess
-import sys
 import warnings
 from collections import Counter
 
@@ -69,11 +68,6 @@ class TestReadsWhatIsStored(BaseTester):
         counts = walked(150, 0, tmp_path)
         assert min(counts["read"], counts["refused"]) > 50
 
-    @pytest.mark.slow
-    def test_property_thousands_of_combinations_of_properties(self, tmp_path):
-        counts = walked(2500, 2, tmp_path)
-        assert counts["read"] > 1300
-
     @pytest.mark.parametrize(
         "compression", ["raw", "tiff_lzw", "tiff_adobe_deflate", "tiff_deflate", "packbits", "jpeg"]
     )
@@ -89,16 +83,6 @@ class TestReadsWhatIsStored(BaseTester):
         found = decoded(data)
         assert found.white == 1
         assert np.array_equal(found.values * np.uint8(255), by_opencv(data))
-
-    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int16, np.int32, np.float32, np.float64])
-    @pytest.mark.parametrize("compression", [1, 5, 8, 32773])
-    def test_feature_what_opencv_writes(self, kind, compression):
-        """LZW with a predictor unless it is told otherwise, in strips of a few rows."""
-        picture = (RGB[..., ::-1] * (1.5 if kind in (np.float32, np.float64) else 1)).astype(kind)
-        data = cv2.imencode(".tif", picture, [cv2.IMWRITE_TIFF_COMPRESSION, compression])[1].tobytes()
-        found = decoded(data).values
-        assert found.dtype == kind
-        assert np.array_equal(found, picture[..., ::-1])
 
     @pytest.mark.parametrize(
         "options",
@@ -160,24 +144,6 @@ class TestReadsWhatIsStored(BaseTester):
         found = decoded(tiff(Page(RGB, photometric=2, fields={274: (3, [orientation])})))
         assert np.array_equal(found.values, RGB)
         assert found.orientation == (orientation if 1 <= orientation <= 8 else 1)
-
-    def test_feature_metadata_of_microscopes_are_not_looked_at(self, capfd):
-        """LSM, NDPI, ImageJ, STK of one plane, OME with another file, ScanImage, Philips, SIS: tifffile parses them."""
-        texts = (
-            b"ImageJ=1.53\nimages=1\nslices=1\n\0",
-            b"<DataObject ObjectType='DPUfsImport'>\0",
-            b"state.configPath = 1\0",
-            b'{"shape": [40, 60, 3]}\0',
-            b"Aperio \0",
-            b'<?xml version="1.0"?><OME><TiffData><UUID FileName="/etc/passwd"/></TiffData></OME>\0',
-            b"!!junk!!\xff\0",
-        )
-        for text in texts:
-            fields = {270: (2, text), 305: (2, b"Philips DP\0"), 34412: (7, bytes(99)), 65420: (3, [1]),
-                      33629: (5, [1, 1]), 33560: (7, bytes(64)), 50838: (4, [12, 8]), 50839: (1, bytes(20)),
-                      65330: (4, [1])}  # fmt: skip
-            assert np.array_equal(decoded(tiff(Page(RGB, photometric=2, fields=fields))).values, RGB)
-        assert capfd.readouterr() == ("", "")
 
 
 class TestMissingValues(BaseTester):
@@ -311,13 +277,6 @@ class TestRefused(BaseTester):
         for read in (read_image, read_depth):
             with pytest.raises(ValueError, match=re.escape("a.tif: it holds 3 pictures (pages): save the one that is")):
                 read(tmp_path / "a.tif")
-
-    @pytest.mark.takes_seconds
-    def test_feature_no_word_of_a_library_in_a_process_without_logging(self, tmp_path):
-        (tmp_path / "a.tif").write_bytes(by_pillow(RGB[..., 0] > 99, compression="group3"))
-        script = f"from kornia_tidy.data import read_image; read_image({str(tmp_path / 'a.tif')!r})"
-        run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-        assert (run.stdout, run.stderr) == ("", "")
 
     def test_feature_no_warning_and_no_word_of_a_library(self, capfd):
         with warnings.catch_warnings():

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.cli.commands import demo
-from kornia_tidy.data import read_image, write_depth, write_image
+from kornia_tidy.data import read_image
 from kornia_tidy.figures import demonstration
 from tests.base import BaseTester
 
@@ -68,27 +67,6 @@ class TestDemo(BaseTester):
     def test_exception_families_are_named(self, tmp_path, capsys):
         assert main(["demo", "-o", str(tmp_path), "--family", "lens"]) == 2
         assert "spiral" in capsys.readouterr().err
-
-    @pytest.mark.takes_seconds
-    def test_feature_a_scene_of_ones_own_is_stretched_over_the_range(self, tmp_path, capsys):
-        write_image(tmp_path / "image.png", torch.rand(1, 64, 96))
-        write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))
-        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm")]
-        assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
-        assert "depth 0.2975 to inf m" in capsys.readouterr().out
-        assert read_image(tmp_path / "out" / "coded_capture.png").shape == (3, 64, 96)
-        near = read_image(tmp_path / "out" / "depth.png")
-        assert near.min() == 0
-        assert near.max() == 1
-
-    @pytest.mark.takes_seconds
-    def test_feature_large_pictures_are_made_smaller(self, tmp_path, monkeypatch, capsys):
-        monkeypatch.setattr(demo, "LARGEST", 48)
-        write_image(tmp_path / "image.png", torch.rand(3, 64, 96))
-        write_depth(tmp_path / "depth.pfm", torch.linspace(3, 6, 64 * 96).view(1, 64, 96))
-        files = ["--image", str(tmp_path / "image.png"), "--depth", str(tmp_path / "depth.pfm")]
-        assert main(["demo", *files, "-o", str(tmp_path / "out")]) == 0
-        assert "48 x 32 px" in capsys.readouterr().out
 
     def test_exception_an_image_without_depth(self, tmp_path, monkeypatch, capsys):
         monkeypatch.chdir(tmp_path)

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +29,6 @@ from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester, shared
 from tests.lab.raw.dng import DOUBLE, dng
 
-FILES = 8  # in the batch that gets a signal
 ENDS = [".png", ".jpg", "_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png", ".json"]
 
 
@@ -306,44 +300,3 @@ class TestRawReconstruct(BaseTester):
             assert reconstruct(*words) == 2
             assert sentence in capsys.readouterr().err
         assert not folder.exists() or not list(folder.iterdir())
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGKILL])
-    def test_feature_a_signal_leaves_whole_files_only(self, tmp_path, signum):
-        """In processes of their own, all of which get it, as by Ctrl-C, once the first file is done."""
-        files = [tmp_path / f"{i}.dng" for i in range(FILES)]
-        for i, path in enumerate(files):
-            path.write_bytes(raw_file((300, 400), i))
-        folder = tmp_path / "out"
-        command = [sys.executable, "-m", "kornia_tidy", "raw", "reconstruct", *map(str, files), "--head"]
-        command += [checkpoint(tmp_path / "joint.safetensors", task="joint"), "-o", str(folder)]
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background ignore it
-        process = subprocess.Popen(
-            [*command, "--resume"], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True
-        )
-        signal.signal(signal.SIGINT, before)
-        deadline = time.monotonic() + 120
-        while not list(folder.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        os.killpg(process.pid, signum)
-        _, err = process.communicate(timeout=60)
-        assert "Traceback" not in err
-        if signum == signal.SIGINT:
-            assert process.returncode == 130, err
-            assert err.endswith("kornia-tidy: interrupted\n")
-            assert not list(folder.glob(".*"))
-        else:
-            assert process.returncode == -signal.SIGKILL
-        finished = {path.stem for path in folder.glob("*.json")}
-        assert 0 < len(finished) < FILES
-        for path in folder.glob("[!.]*"):
-            if path.suffix in {".png", ".jpg"} and "colors" not in path.name:
-                assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape[:2] == (300, 400)
-        for stem in finished:
-            assert all((folder / f"{stem}{end}").stat().st_size for end in ENDS)
-        kept = {stem: (folder / f"{stem}.png").stat().st_mtime_ns for stem in finished}
-        again = subprocess.run([*command, "--resume"], check=False, capture_output=True, timeout=250, text=True)
-        assert again.returncode == 0, again.stderr
-        assert again.stdout.count("kept") == len(finished)
-        assert sorted(contents(folder)) == sorted(f"{i}{end}" for i in range(FILES) for end in ENDS)
-        assert all((folder / f"{stem}.png").stat().st_mtime_ns == then for stem, then in kept.items())
