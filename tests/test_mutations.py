@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
-
 import numpy as np
 import pytest
 
 from tests.base import BaseTester
-from tests.mutations import reading
 from tests.mutations.damage import damaged
 from tests.mutations.forked import prepare, run
-from tests.mutations.pristine import Case, make_cases
+from tests.mutations.pristine import make_cases
 from tests.mutations.readers import SHARES, make_readers
-from tests.mutations.reading import damaged_case, read_all, shared_out
+from tests.mutations.reading import read_all, shared_out
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 KINDS = (
@@ -81,27 +76,3 @@ class TestReaders(BaseTester):
             results = list(read_all(readers[kind], 11, range(count), tmp_path))
             assert [number for number, *_ in results] == list(range(count))
             assert not [read[:3] for read in results if read[1] == "failed"], kind
-
-    def test_feature_a_reader_that_dies_hangs_or_raises_anything_else_is_told(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(reading, "SECONDS", 1.0)
-        whole = tmp_path / "a.json"
-        whole.write_text("{}")
-
-        def misbehave(path):
-            which = len(path.read_bytes()) % 4
-            if which == 0:
-                os.kill(os.getpid(), signal.SIGTERM)
-            elif which == 1:
-                time.sleep(60)
-            elif which == 2:
-                raise KeyError(which)
-            raise ValueError("a sentence")
-
-        case = Case("json", "raw", whole, misbehave)
-        results = list(read_all([case], 0, range(12), tmp_path))
-        assert [number for number, *_ in results] == list(range(12))
-        for number, result, said, _ in results:
-            size = len(damaged_case([case], 0, number)[2]) % 4
-            expected = ("status -15", "status", "KeyError", "")[size]
-            assert (result == "failed") == (size < 3)
-            assert expected in said

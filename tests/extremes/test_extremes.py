@@ -26,9 +26,6 @@ class TestExtremes:
             pytest.skip(row.absent)
         measure(row)
 
-    def test_feature_names_are_unique(self):
-        assert len({row.name for row in ROWS}) == len(ROWS)
-
     def test_feature_the_page_has_every_row(self):
         lines = PAGE.read_text(encoding="utf-8").splitlines()
         for row in ROWS:

@@ -24,21 +24,18 @@ from kornia_tidy import (
     SpatialLightModulator,
     ThinLensCamera,
     TiDyOptics,
-    simulate,
 )
 from kornia_tidy.augmentation.arrays import depth_to_tensor
 from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.image_types import depth_tensor
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.cli import main
-from kornia_tidy.data import DeadLeaves
 from kornia_tidy.data.depth_files import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.masks import ZernikeMask
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
 from kornia_tidy.modulator.switching import Switching
-from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.reconstruction.trained import check_weights
@@ -169,19 +166,6 @@ class TestDepthScale(BaseTester):
     def test_feature_far_scenes_are_no_mistake(self, read, stored, scale, tmp_path):
         found = read(stored.reshape(6, 8), scale, tmp_path).numpy()[0]
         np.testing.assert_allclose(found, stored.reshape(6, 8) * np.float64(scale), rtol=1e-6)
-
-    @pytest.mark.parametrize("scale", [1.0, 1000.0, 5000.0])
-    def test_feature_each_unit_that_a_caller_may_mean_is_told(self, scale):
-        """Float metres with fractions, which look like kilometres, are told by the camera."""
-        image, metres = np.zeros((48, 64, 3), np.uint8), np.random.default_rng(0).uniform(0.5, 3, (48, 64))
-        for depth in ((1000 * metres).astype(np.uint16), *([metres] if scale == 1000 else [])):
-            with warnings.catch_warnings(record=True) as told:
-                warnings.simplefilter("always")
-                try:
-                    simulate(image, depth, scale, optics=camera(sensor=None))
-                except ValueError as error:
-                    told.append(error)
-            assert len(told) == 1
 
     @pytest.mark.parametrize(
         ("command", "output"),
@@ -486,10 +470,6 @@ class TestDepthFiles(BaseTester):
         path.write_bytes(encode_pfm(self.disparity() / 20))
         read_depth(path)
 
-    def test_feature_maps_without_a_number_raise_no_alarm(self, tmp_path):
-        (tmp_path / "a.pfm").write_bytes(encode_pfm(np.full((8, 8), np.inf, np.float32)))
-        assert read_depth(tmp_path / "a.pfm").valid.all()
-
     @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry["invalid"] == "inf"])
     def test_feature_real_disparities_without_their_options_are_told(self, name, tmp_path):
         path = shutil.copy(shared(f"data/{ENTRIES[name]['depth']}"), tmp_path)
@@ -527,14 +507,3 @@ class TestNoFalseAlarm(BaseTester):
                 camera(camera=lens)(image, depth)
             inverse_depth = (1 / depth - 1 / far) / (1 / near - 1 / far)
             camera(camera=DefocusRange())(image, inverse_depth.clamp(0, 1))
-
-    def test_feature_dead_leaves(self):
-        for item in range(4):
-            leaves = DeadLeaves(4, 64, 64, seed=3)[item]
-            camera()(leaves["image"], leaves["depth"])
-
-    @pytest.mark.parametrize("name", SYSTEMS)
-    def test_feature_presets(self, name):
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=".*beyond the camera's range|the largest PSF window")
-            TiDyOptics.from_preset(name, fidelity="draft")(*scene(1.5))

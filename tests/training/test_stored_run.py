@@ -133,27 +133,6 @@ class TestCheckStoredRun(BaseTester):
         one, other = (read_state(path / "last.safetensors")["state_dict"] for path in (folder, tmp_path / "run"))
         assert [name for name, weight in one.items() if not torch.equal(weight, other[name])] == []
 
-    @pytest.mark.slow
-    def test_feature_what_is_accepted_ends_as_an_undisturbed_run(self, stored, tmp_path):
-        """Among it flags that were dropped, counts of other loops, rates, and a state without the newer entries."""
-        folder, states, parts = stored
-        wanted, accepted = read_state(folder / "last.safetensors")["state_dict"], []
-        for name, value, state in variants(states[2]):
-            if "/best" in name or "/waited" in name or "/random/" in name or value_at(states[2], name) is value:
-                continue
-            if refusal(state, parts) is None:
-                accepted.append((name, value, state))
-        assert len(accepted) > 30
-        for name, value, state in random.Random(7).sample(accepted, 12):
-            again = tmp_path / "again"
-            shutil.copytree(folder, again)
-            write_state(again / "last.safetensors", state)
-            run.train(SETTINGS, again, resume=True)
-            found = read_state(again / "last.safetensors")
-            assert found["global_step"] == 4, (name, value)
-            assert all(torch.equal(weight, wanted[key]) for key, weight in found["state_dict"].items()), (name, value)
-            shutil.rmtree(again)
-
     @pytest.mark.parametrize(
         ("place", "value", "sentence"),
         [
