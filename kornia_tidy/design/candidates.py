@@ -75,7 +75,7 @@ def search_lens(task: DesignTask, masks: PixelwiseMask | None, f_number: float, 
         window=task.search_window(f_number, focus),
         stray_light="veil",
     )
-    return task.lens(masks, f_number, focus, fidelity, Spectrum.monochrome())
+    return task.psf_model(masks, f_number, focus, fidelity, Spectrum.monochrome())
 
 
 def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -92,17 +92,22 @@ def cost_of(task: DesignTask, lens: PSFModel, f_number: float) -> tuple[Tensor, 
         f_number: of the lens.
 
     Returns:
-        Cost in dB, R and E, each 0-dimensional. Parts without a weight are NaN.
+        Cost in dB, R and E, each 0-dimensional: of a real lens the mean over the task's places, E by squares. Parts
+        without a weight are NaN.
     """
     weight, unknown = task.depth_weight, torch.tensor(math.nan)
+    bank = lens.psf_bank(field=task.places()) if task.lens else lens.psf_bank()
     if weight == 0:
-        error = restoration_error(lens.psf_bank(), task.sensor(f_number), task.statistics)
+        error = restoration_error(bank, task.sensor(f_number), task.statistics)
         return 10 * error.log10().float(), error, unknown
-    confusion = depth_confusion(lens.psf_bank(), task.noise(f_number), task.statistics)
-    cost = 20 * weight * confusion.depth.log10().float()
+    banks = [bank.at(index) for index in range(len(bank.psfs))] if task.lens else [bank]
+    confusions = [depth_confusion(own, task.noise(f_number), task.statistics) for own in banks]
+    depth = torch.stack([own.depth for own in confusions]).square().mean().sqrt()
+    image = torch.stack([own.image for own in confusions]).mean()
+    cost = 20 * weight * depth.log10().float()
     if weight == 1:
-        return cost, unknown, confusion.depth
-    return cost + 10 * (1 - weight) * confusion.image.log10().float(), confusion.image, confusion.depth
+        return cost, unknown, depth
+    return cost + 10 * (1 - weight) * image.log10().float(), image, depth
 
 
 def flat_candidate(task: DesignTask, f_number: float, focus: float) -> Candidate:

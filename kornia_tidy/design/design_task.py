@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +15,9 @@ from kornia_tidy.design.settings import LARGEST_MASK, MOST_MASKS, DesignSettings
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
+from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy.optics.lens.made_lenses import RGB, named_focal_length
+from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLensCamera
 from kornia_tidy.psf.psf_model import PSFModel
@@ -21,6 +25,7 @@ from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
 from kornia_tidy.sensor.sensor import SensorNoise
 
 SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
+_PLACES = 3  # over the field of a real lens
 _PER_FOCAL_LENGTH = 1.22 * 2  # Airy disc: diameter / (wavelength * f-number)
 
 
@@ -51,6 +56,14 @@ class DesignTask(DesignSettings):
     statistics: SceneStatistics = PHOTOGRAPHS
 
     def __post_init__(self) -> None:
+        if self.lens is not None:
+            own = named_focal_length(self.lens)
+            if self.focal_length not in (DesignSettings.focal_length, own):
+                raise ValueError(
+                    f"focal_length must be that of the lens {self.lens!r}, {own:.4g} m, got {self.focal_length:.4g} m: "
+                    f"leave it out"
+                )
+            object.__setattr__(self, "focal_length", own)
         check_metres("focal_length", self.focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
         check_metres("pixel_pitch", self.pixel_pitch, *PITCHES, "8 um is 8e-6")
         check_part("modulator", self.modulator, nn.Module, "a modulator such as DwellTimes()")
@@ -94,10 +107,10 @@ class DesignTask(DesignSettings):
     def f_numbers(self) -> tuple[float, ...]:
         """Return the coarse grid of f-numbers: from four stops wider to one stop slower than balanced, a stop apart.
 
-        A stop is a factor of sqrt 2, which halves the light.
+        A stop is a factor of sqrt 2, which halves the light. Those too wide for a real lens are left out.
         """
         steps = [self.balanced_f_number * 2 ** (step / 2) for step in range(-4, 2)]
-        return tuple(f_number for f_number in steps if f_number >= FASTEST)
+        return tuple(f_number for f_number in steps if f_number >= FASTEST and self._traces(f_number))
 
     def camera(self, f_number: float, focus: float) -> ThinLensCamera:
         """Return the lens at an f-number.
@@ -132,14 +145,39 @@ class DesignTask(DesignSettings):
         """Return the standard deviation of the noise at the scenes' mean light, full scale 1."""
         return float(self.sensor(f_number).std(torch.tensor(self.statistics.mean, dtype=torch.float64)))
 
-    def lens(
+    def psf_model(
         self, masks: PixelwiseMask | None, f_number: float, focus: float, fidelity: Fidelity, spectrum: Spectrum
     ) -> PSFModel:
         """Return the lens with masks in its pupil, or the flat lens for None."""
-        camera = self.camera(f_number, focus)
+        camera, real = self.camera(f_number, focus), self.real_lens(f_number, focus)
         if masks is None:
-            return PSFModel(flat_mask(self.mask_size), camera, DwellTimes(), fidelity, spectrum)
-        return PSFModel(masks, camera, self.modulator, fidelity, spectrum)
+            return PSFModel(flat_mask(self.mask_size), camera, DwellTimes(), fidelity, spectrum, lens=real)
+        return PSFModel(masks, camera, self.modulator, fidelity, spectrum, lens=real)
+
+    def real_lens(self, f_number: float, focus: float) -> Lens | None:
+        """Return the real lens at an f-number and a focus, None where the lens is ideal.
+
+        Raises:
+            ValueError: if it cannot be traced at this f-number.
+        """
+        if self.lens is None:
+            return None
+        return _traced(self.lens, f_number, float(self.camera(f_number, focus).focus_distance), self.depth_range[0])
+
+    def places(self) -> tuple[tuple[float, float], ...]:
+        """Return places that stand for parts of equal area of a real lens's field, y and x in pixels from its axis."""
+        if self.lens is None:
+            return ()
+        edge = NAMED_LENSES[self.lens]["field"] / self.pixel_pitch / math.sqrt(2)  # along the diagonal
+        heights = [edge * math.sqrt((part + 0.5) / _PLACES) for part in range(_PLACES)]
+        return tuple((height, height) for height in heights)
+
+    def _traces(self, f_number: float) -> bool:
+        try:
+            self.real_lens(f_number, 0.5)
+        except ValueError:
+            return False
+        return True
 
     def search_window(self, f_number: float, focus: float) -> int:
         """Return the side of the PSFs during the search, in pixels: the widest blur disc, half as much again, odd."""
@@ -149,6 +187,13 @@ class DesignTask(DesignSettings):
         disc = 2 * max(map(abs, camera.defocus_range)) * REFERENCE_WAVELENGTH / (math.pi * step)
         airy = _PER_FOCAL_LENGTH * REFERENCE_WAVELENGTH * image_distance / camera.aperture_diameter / self.pixel_pitch
         return 2 * round(min(max(1.3 * disc + 2 * airy + 8, 33), 129) / 2) + 1
+
+
+@lru_cache(maxsize=64)
+def _traced(name: str, f_number: float, focus_distance: float, nearest: float) -> Lens:
+    entry = NAMED_LENSES[name]
+    given = f_number, focus_distance, RGB, entry["field"], nearest
+    return Lens.from_prescription(entry["prescription"], *given)
 
 
 def flat_mask(size: int = 23) -> PixelwiseMask:

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from kornia_tidy.choices import LENSES
 from kornia_tidy.reconstruction.settings import LensSettings, MaskSettings
-from kornia_tidy.settings import DepthRange, Electrons, FNumber, Metres, Unit
+from kornia_tidy.settings import DepthRange, Electrons, FNumber, Metres, Unit, one_of
 
 MOST_MASKS = 64
 LARGEST_MASK = 1024  # pixels along a side: a search with more would take days
@@ -29,6 +30,8 @@ class DesignSettings:
         read_noise: its standard deviation.
         masks: in one exposure.
         mask_size: pixels along a side of a mask; 20 of 23 span the aperture, and more pixels scatter less light.
+        lens: a real lens by its name, over whose field cameras are compared; its focal length is taken. None: an ideal
+            lens.
     """
 
     depth_range: DepthRange = (0.2975, math.inf)
@@ -41,3 +44,4 @@ class DesignSettings:
     read_noise: Electrons = 2.4
     masks: Annotated[int, Unit("K", "", 1, MOST_MASKS)] = MaskSettings.masks
     mask_size: Annotated[int, Unit("N", "", 1, LARGEST_MASK)] = MaskSettings.mask_size
+    lens: Annotated[str, one_of(LENSES)] | None = None

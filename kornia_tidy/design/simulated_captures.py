@@ -26,6 +26,7 @@ from kornia_tidy.design.closed_forms import (
 from kornia_tidy.design.design_task import DesignTask, flat_mask
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.seeds import keyed_seed
 
 DECISION = Fidelity("decision", pixel_tolerance=0.1, window=129, stray_light="veil")
@@ -52,7 +53,16 @@ def candidate_optics(task: DesignTask, candidate: Candidate, fidelity: Fidelity 
         task.sensor(candidate.f_number),
         fidelity,
         color_space="linear",
+        lens=task.real_lens(candidate.f_number, candidate.focus),
+        field_center=task.places()[1] if task.lens else (0.0, 0.0),  # outside of half the field
     )
+
+
+def _bank_of(optics: TiDyOptics, defocus: list[float] | None = None) -> PSFBank:
+    """Return the PSFs of a camera at the middle of its pictures."""
+    if optics.lens is None:
+        return optics.psf_bank(defocus=defocus)
+    return optics.psf_bank(defocus=defocus, field=[optics.field_center]).at(0)
 
 
 @torch.no_grad()
@@ -71,9 +81,9 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
     """
     optics = candidate_optics(task, candidate)
     noise = task.noise(candidate.f_number)
-    bank = optics.psf_bank()
+    bank = _bank_of(optics)
     lo, hi = optics.camera.defocus_range
-    depths = optics.psf_bank(defocus=torch.linspace(lo, hi, DEPTHS).tolist()) if task.depth_weight > 0 else bank
+    depths = _bank_of(optics, torch.linspace(lo, hi, DEPTHS).tolist()) if task.depth_weight > 0 else bank
 
     @lru_cache(maxsize=1)
     def forms(size: tuple[int, int]) -> tuple[WienerFilter | None, DepthLikelihood | None, list[WienerFilter]]:

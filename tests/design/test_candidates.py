@@ -1,11 +1,22 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from kornia_tidy.data import SceneStatistics
-from kornia_tidy.design.candidates import STARTS, coded_candidate, flat_candidate, initial_phase, search_lens
+from kornia_tidy.design.candidates import (
+    STARTS,
+    coded_candidate,
+    cost_of,
+    flat_candidate,
+    initial_phase,
+    search_lens,
+)
 from kornia_tidy.design.design_task import DesignTask, mask_of
+from kornia_tidy.design.objectives import restoration_error
+from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes, score_candidate
 from kornia_tidy.modulator.modulator import SpatialLightModulator
 from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.modulator.switching import Switching
@@ -71,3 +82,38 @@ class TestInitialPhase(BaseTester):
             middles = [lo + (hi - lo) * (third + 0.5) / 3 for third in range(3)]
             peaks = lens.psf_bank(defocus=middles).psfs.amax((1, 2, 3))
             assert int(peaks.argmax()) == number
+
+
+class TestRealLens(BaseTester):
+    @torch.no_grad()
+    def test_feature_cost_is_that_of_places_over_the_field(self):
+        """Each place stands for an equal area; the search and the captures see the lens there."""
+        task = DesignTask(masks=1, lens="single-50mm", depth_range=(0.5, 0.7))
+        assert task.focal_length == pytest.approx(0.05, rel=1e-4)
+        heights = [math.hypot(*place) * task.pixel_pitch for place in task.places()]
+        assert [round((h / 6.784e-3) ** 2 * 6) for h in heights] == [1, 3, 5]
+        lens = search_lens(task, None, 14.0, 0.5)
+        cost, error, _ = cost_of(task, lens, 14.0)
+        each = [restoration_error(lens.psf_bank(field=[p]).at(0), task.sensor(14.0)) for p in task.places()]
+        assert float(error) == pytest.approx(float(torch.stack(each).mean()), rel=1e-4)
+        ideal = DesignTask(masks=1, focal_length=task.focal_length, depth_range=(0.5, 0.7))
+        assert float(cost) > float(cost_of(ideal, search_lens(ideal, None, 14.0, 0.5), 14.0)[0]) + 0.1
+
+    def test_feature_masks_and_depth(self):
+        task = DesignTask(masks=1, lens="single-50mm", depth_range=(0.5, 0.7), depth_weight=0.5)
+        found = coded_candidate(task, "focal sweep", 20.0, 0.5, steps=2)
+        assert 0 < found.image_error < 1
+        assert 0 < found.depth_error < 1
+        optics = candidate_optics(task, found)
+        assert optics.lens.name == "single-50mm"
+        assert optics.field_center == task.places()[1]
+        [scores] = score_candidate(task, found, leaf_scenes(1, 140, task.depth_range))
+        assert {"image", "depth"} == set(scores)
+
+    def test_exception(self):
+        with pytest.raises(ValueError, match="name of a lens must be one of"):
+            DesignTask(lens="sonnar")
+        with pytest.raises(
+            ValueError, match=r"focal_length must be that of the lens 'single-50mm', 0\.05 m, got 0\.035 m"
+        ):
+            DesignTask(lens="single-50mm", focal_length=0.035)

@@ -105,6 +105,9 @@ pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
     kornia-tidy design --depth-range 0.5 4 --electrons 5000 --bits 8 \\
         --switching-time 4e-3 --exposure 33e-3 -o outputs/dim
 
+  Behind a real lens, scored over its field:
+    kornia-tidy design --lens single-50mm --quick -o outputs/single
+
   Image and depth count alike; your own scenes decide too:
     kornia-tidy design --depth-weight 0.5 --scenes my/scenes -o outputs/both
 """
