@@ -180,6 +180,11 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
                 f"image must be floating point in [0, 1], got {input.dtype}: divide it by the largest value of its "
                 f"type, or use as_transform(), which takes 8 and 16 bits"
             )
+        count = 1 if input.ndim == 3 else len(input)
+        if params is not None and (drawn := params.get("batch_prob")) is not None and len(drawn) != count:
+            raise ValueError(
+                f"params must be the draw of a batch of {count}, as the image is, got that of {len(drawn)}"
+            )
         if depth is None:
             return super().forward(input, params=params, **kwargs)
         check_float_tensor("depth", depth, input.ndim, "(B, 1, H, W) or (1, H, W), as the image is batched or not")

@@ -9,7 +9,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_generator, check_metres, check_positive
+from kornia_tidy.checks import check_choice, check_generator, check_metres, check_positive, described
 from kornia_tidy.masks.limits import CONSTRAINTS, limited_phase
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -212,6 +212,8 @@ def check_number_of_masks(num_masks: int, pixels: int = 1) -> None:
         >>> check_number_of_masks(5, 23 * 23)
     """
     check_positive("num_masks", num_masks)
+    if not hasattr(num_masks, "__index__"):
+        raise TypeError(f"num_masks must be a whole number, got {described(num_masks)}")
     if num_masks > MOST_MASKS or num_masks * pixels > MOST_PIXELS:
         raise ValueError(
             f"num_masks must be at most {min(MOST_MASKS, MOST_PIXELS // pixels)} for masks of {pixels} pixels, "

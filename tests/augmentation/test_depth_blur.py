@@ -134,6 +134,10 @@ class TestRandomDepthBlur(BaseTester):
     def test_exception(self):
         with pytest.raises(ValueError, match="focus_distance must be beyond the focal length"):
             RandomDepthBlur(focus_distance=(0.01, 1.0))
+        augmentation, (image, depth) = RandomDepthBlur(p=1.0), scene(2)
+        augmentation(image, depth)
+        with pytest.raises(ValueError, match="params must be the draw of a batch of 1, as the image is, got that of 2"):
+            augmentation(image[:1], depth[:1], params=augmentation._params)
         with pytest.raises(ValueError, match=r"f_number must be a range \(low, high\)"):
             RandomDepthBlur(f_number=(4.0, 2.0))
         with pytest.raises(ValueError, match="compositing must be one of 'gather', 'scatter', 'occlusion', got 'x'"):

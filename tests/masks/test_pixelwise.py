@@ -74,6 +74,10 @@ class TestPixelwiseMask(BaseTester):
         with pytest.raises(ValueError, match=sentence):
             PixelwiseMask(**options)
 
+    def test_exception_a_part_of_a_mask(self):
+        with pytest.raises(TypeError, match=r"num_masks must be a whole number, got the number 1\.5"):
+            PixelwiseMask(1.5)
+
     def test_exception_a_mask_that_cannot_be_centred(self):
         with pytest.raises(ValueError, match="rows and columns of a mask must both be odd or both even, got 4 and 3"):
             PixelwiseMask(initial=torch.zeros(2, 4, 3))

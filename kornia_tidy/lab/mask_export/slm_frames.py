@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.masks.base import PhaseMasks, metres_to_radians
+from kornia_tidy.masks.base import HEIGHTS, PhaseMasks, metres_to_radians
 from kornia_tidy.modulator.phase_panel import GreyLevels, nearest_level
 from kornia_tidy.optics.materials import Material, constant_index
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -151,9 +151,11 @@ def checked_heights(heights: Tensor) -> Tensor:
 
     Raises:
         TypeError: if heights are not a floating-point tensor.
-        ValueError: if heights have another shape or are not finite.
+        ValueError: if heights have another shape, are not finite, or are no metres.
     """
     check_float_tensor("heights", heights, 3, "(K, rows, columns)")
     if not heights.numel() or not bool(torch.isfinite(heights).all()):
         raise ValueError(f"heights must be finite metres, at least one, got a map of shape {tuple(heights.shape)}")
+    if (highest := float(heights.detach().abs().max())) > HEIGHTS[1]:
+        raise ValueError(f"heights must be metres within {HEIGHTS[1]:g} (1 um is 1e-6), got {highest:g}")
     return heights.detach().cpu().double()

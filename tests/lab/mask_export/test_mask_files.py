@@ -39,7 +39,7 @@ class TestMaskFiles(BaseTester):
         write_heights(tmp_path / "m.npy", heights)
         assert np.array_equal(np.load(tmp_path / "m.npy"), heights.numpy())
         assert torch.equal(read_heights(tmp_path / "m.npy"), heights)
-        np.save(tmp_path / "one.npy", np.ones((3, 3), np.float32))
+        np.save(tmp_path / "one.npy", np.full((3, 3), 1e-6, np.float32))
         assert read_heights(tmp_path / "one.npy").shape == (1, 3, 3)
 
     def test_feature_dwell_times_come_with_the_state(self):
@@ -81,4 +81,4 @@ class TestMaskFiles(BaseTester):
             with pytest.raises((ValueError, FileNotFoundError), match=sentence):
                 read_heights(tmp_path / name)
         with pytest.raises(ValueError, match="suffix of a file of masks"):
-            write_heights(tmp_path / "m.csv", torch.ones(1, 2, 2))
+            write_heights(tmp_path / "m.csv", torch.zeros(1, 2, 2))

@@ -35,6 +35,8 @@ class TestSLMFrames(BaseTester):
             SLMFrames.of(torch.zeros(2, 2), GreyLevels(8))
         with pytest.raises(ValueError, match="heights must be finite metres"):
             SLMFrames.of(torch.full((1, 2, 2), math.nan), GreyLevels(8))
+        with pytest.raises(ValueError, match=r"heights must be metres within 0.001 \(1 um is 1e-6\), got 530"):
+            SLMFrames.of(torch.full((1, 2, 2), 530.0), GreyLevels(8))
         with pytest.raises(ValueError, match="NOA61 is published for 450 to 1550 nm, got 400 nm"):
             SLMFrames.of(torch.zeros(1, 2, 2), GreyLevels(8), 400e-9, NOA61)
 
