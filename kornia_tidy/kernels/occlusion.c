@@ -94,8 +94,8 @@ typedef struct {
     lines psfs;         // of a row of tiles, by layer and channel
     vec *psf;           // of a tile, (ORDERS, vectors), and
     double *tables;     // their tables
-    void *all[22];
-    int count;
+    void *last;         // buffer that was taken, which begins with the address of the one before it
+    int ok;             // whether there was memory for all
 } workspace;
 
 // ---- Tables: partial sums over the ends of a PSF's rows, by which the blur of a run is a difference of two entries.
@@ -534,15 +534,19 @@ static void count_block(const scene_parameters *s, workspace *d, int64_t x, int6
 // ---- Workspaces.
 
 static void *take(workspace *d, int64_t bytes) {
-    void *memory = aligned_alloc(64, (bytes + 127) / 64 * 64);
-    if (memory) memset(memory, 0, bytes);
-    return d->all[d->count++] = memory;
+    char *memory = aligned_alloc(64, 64 + (bytes + 127) / 64 * 64);
+    d->ok &= memory != 0;
+    if (!memory) return 0;
+    memset(memory, 0, 64 + bytes);
+    *(void **)memory = d->last;
+    d->last = memory;
+    return memory + 64;
 }
 
 static int allocate_workspace(const scene_parameters *s, workspace *d) {
     int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, pitch = window_pitch(s);
     outline *o = &d->outline;
-    d->count = 0, d->window = 0;
+    d->last = 0, d->ok = 1, d->window = 0;
     d->runs = take(d, rows * (s->width + s->side) * sizeof(run));
     d->made = take(d, rows * sizeof *d->made);
     d->heads = take(d, rows * sizeof *d->heads);
@@ -561,16 +565,15 @@ static int allocate_workspace(const scene_parameters *s, workspace *d) {
     o->own.rows = take(d, rows * sizeof(edge));
     o->behind.rows = take(d, rows * sizeof(edge));
     d->kept = take(d, (s->gradient ? (s->layers + 1) * s->channels : 1) * sizeof *d->kept);
-    int ok = take_lines(&s->over, s->layers * s->channels, s->side * s->side, &d->psfs);
+    d->ok &= take_lines(&s->over, s->layers * s->channels, s->side * s->side, &d->psfs);
     d->psf = take(d, ORDERS * d->psfs.vectors * sizeof(vec));
     d->tables = take(d, (s->over.node_rows ? ORDERS : 0) * table_size(s) * sizeof(double));
-    for (int n = 0; n < d->count; n++) ok &= d->all[n] != 0;
-    for (int64_t r = 0; ok && r < rows; r++) d->made[r] = -1;
-    return ok;
+    for (int64_t r = 0; d->ok && r < rows; r++) d->made[r] = -1;
+    return d->ok;
 }
 
 static void free_workspace(workspace *d) {
-    for (int n = 0; n < d->count; n++) free(d->all[n]);
+    for (void *own = d->last, *before; own; own = before) before = *(void **)own, free(own);
     free_lines(&d->psfs);
 }
 

@@ -6,7 +6,7 @@ import pickle
 import weakref
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -19,10 +19,9 @@ _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among th
 
 @dataclass(frozen=True, eq=False)
 class _Remembered:
-    """Tensors of some depths, and what was made of those that were asked for last."""
+    """Tensors of each depth, and what was made of those that were asked for last."""
 
-    defocus: tuple[float, ...] = ()
-    tensors: tuple[Tensor, ...] = ()
+    depths: dict[float, tuple[Tensor, ...]] = field(default_factory=dict)
     asked: tuple[tuple[float, ...], Hashable] | None = None
     formed: Any = None
     nbytes: int = 0
@@ -75,24 +74,26 @@ class PSFMemory:
         with torch.inference_mode(False), torch.no_grad():  # what is remembered serves in training too
             known = self._held.pop(key, None) or _Remembered()
             if known.asked != (defocus, how):
-                nodes, tensors = known.defocus, known.tensors
-                if missing := tuple(sorted({*defocus} - {*nodes})):
+                depths, made = known.depths, ()
+                if missing := tuple(sorted({*defocus} - {*depths})):
                     made = tuple(tensor.contiguous() for tensor in make(missing))
-                    tensors = tuple(map(torch.cat, zip(tensors, made, strict=True))) if tensors else made
-                    nodes += missing
+                    depths = depths | dict(zip(missing, zip(*(x.split(1) for x in made), strict=True), strict=True))
                 # Sums are rounded in an order that follows the layout: it is the same whatever is remembered.
-                places = [nodes.index(psi) for psi in defocus]
-                found = tensors if defocus == nodes else tuple(tensor[places] for tensor in tensors)
-                copies = (found is not tensors) + (form is not None)  # what is made of them takes as much again
-                nbytes = sum(len(value) for value in key if isinstance(value, bytes))  # of masks
-                nbytes += sum(x.nbytes for x in tensors) + copies * sum(x.nbytes for x in found)
-                known = _Remembered(nodes, tensors, (defocus, how), form(*found) if form else found, nbytes)
-                held = nbytes + sum(own.nbytes for own in list(self._held.values()))
-                for oldest in list(self._held) if nbytes <= self.most_bytes else ():
-                    if held > self.most_bytes and (own := self._held.pop(oldest, None)) is not None:
-                        held -= own.nbytes
+                whole = missing == defocus
+                found = made if whole else tuple(map(torch.cat, zip(*(depths[psi] for psi in defocus), strict=True)))
+                # What is made of them takes as much again.
+                nbytes = ((not whole) + (form is not None)) * sum(x.nbytes for x in found)
+                nbytes += sum(len(value) for value in key if isinstance(value, bytes))  # of masks
+                if nbytes + sum(x.nbytes for own in depths.values() for x in own) > self.most_bytes:  # all but these go
+                    depths = dict(zip(defocus, zip(*(x.split(1) for x in found), strict=True), strict=True))
+                nbytes += sum(x.nbytes for own in depths.values() for x in own)
+                known = _Remembered(depths, (defocus, how), form(*found) if form else found, nbytes)
             if known.nbytes <= self.most_bytes:
                 self._held[key] = known
+                held = sum(own.nbytes for own in list(self._held.values()))
+                for oldest in list(self._held):  # other threads do the same: after the last of them all is in order
+                    if held > self.most_bytes and oldest is not key:
+                        held -= self._held.pop(oldest, _Remembered()).nbytes
             return known.formed
 
 

@@ -421,6 +421,8 @@ class PSFModel:
         lens = self.fidelity, self._aperture_mark, getattr(self.modulator, "fill_factor", 1.0)
         others = None if self.lens is None else self.lens.table, torch.get_num_threads()
         seen = states, weights, amplitude, self.masks, self.camera, *self.camera.buffers()
+        if type(self.masks).dispersion is not PhaseMasks.dispersion:  # it may depend on buffers and on parameters
+            seen += (*(self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths),)
         return MEMORY.recall(
             values_of(*parts, *lens, *others, *seen),
             nodes,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from unittest.mock import patch
 
 import pytest
@@ -97,6 +99,21 @@ class TestPSFMemory(BaseTester):
         fresh = TiDyOptics(optics.masks, optics.camera, optics.modulator, None, optics.fidelity)
         self.assert_close(after, fresh.psf_bank().psfs, rtol=0, atol=1e-7)
 
+    @torch.no_grad()
+    def test_feature_masks_of_a_glass_that_a_buffer_describes(self):
+        class Tuned(PixelwiseMask):
+            def dispersion(self, wavelength: float) -> float:
+                return 1 + float(self.slope) * (wavelength * 1e9 - 530)
+
+        masks = Tuned(1)
+        masks.register_buffer("slope", torch.tensor(0.0))
+        optics = TiDyOptics(masks, sensor=None, fidelity=SMALL)
+        before = optics.psf_bank(defocus=[0.0]).psfs
+        masks.slope.fill_(5e-3)
+        after = optics.psf_bank(defocus=[0.0]).psfs
+        assert torch.equal(after, TiDyOptics(masks, sensor=None, fidelity=SMALL).psf_bank(defocus=[0.0]).psfs)
+        assert float((after - before).abs().max()) > 1e-4
+
     def test_feature_apertures_that_come_and_go_are_told_apart(self, optics):
         """One that is gone leaves its place in memory to another."""
         for index in range(60):
@@ -144,6 +161,32 @@ class TestPSFMemory(BaseTester):
         memory.recall(("five",), (0.0, 1.0, 2.0, 3.0), make)  # larger than all that may be kept
         memory.recall(values_of(torch.zeros(31)), (0.0,), make)  # so are masks
         assert [*memory._held] == kept  # and nothing goes for them
+
+    def test_feature_a_stream_of_other_depths_stays_within_the_limit_and_copies_nothing(self):
+        memory, made = PSFMemory(10 * 40), []
+
+        def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:
+            made.append(torch.zeros(len(nodes), 5, dtype=torch.float64))
+            return (made[-1],)
+
+        for n in range(40):
+            (found,) = memory.recall(("lens",), (float(n),), make)
+            assert found.data_ptr() == made[-1].data_ptr()
+            held = memory._held[("lens",)]
+            assert sum(x.nbytes for own in held.depths.values() for x in own) <= held.nbytes <= 400
+        assert len(made) == 40
+
+    def test_feature_threads_together_keep_to_the_limit(self):
+        memory, both = PSFMemory(4 * 40), threading.Barrier(4)
+
+        def work(name: int) -> None:
+            for n in range(20):
+                both.wait(timeout=30)
+                memory.recall((name, n), (0.0,), lambda _: (both.wait(timeout=30), torch.zeros(1, 5).double())[1:])
+
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(work, range(4)))
+        assert sum(own.nbytes for own in memory._held.values()) <= memory.most_bytes
 
     def test_feature_values_of_attributes_that_have_no_hash_are_told_apart(self):
         masks, table = PixelwiseMask(1), torch.ones(2)
