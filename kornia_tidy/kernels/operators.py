@@ -16,20 +16,22 @@ from torch import Tensor
 def define(
     name: str,
     schema: str,
-    on_processor: Callable[..., Any],
+    compute: Callable[..., Any],
     fake: Callable[..., Any],
     backward: Callable[..., Any] | None = None,
     keep: Callable[..., None] | None = None,
+    devices: str = "CPU",
 ) -> None:
     """Define an operator ``kornia_tidy::<name>``.
 
     Args:
         name: of the operator.
         schema: arguments and result, as ``torch.library.define`` takes them.
-        on_processor: the implementation.
+        compute: the implementation.
         fake: returns the memory of the result, also for tensors without memory.
         backward: its gradient, as ``torch.library.register_autograd`` takes it. Without one it refuses to have any.
         keep: saves what ``backward`` needs.
+        devices: that ``compute`` is for, as ``torch.library.impl`` takes them; ``"default"``: all.
     """
     operator = f"kornia_tidy::{name}"
 
@@ -39,7 +41,7 @@ def define(
         )
 
     torch.library.define(operator, schema)
-    torch.library.impl(operator, "CPU", on_processor)
+    torch.library.impl(operator, devices, compute)
     torch.library.register_fake(operator, fake)
     torch.library.register_autograd(operator, backward or refuse, setup_context=keep)
 

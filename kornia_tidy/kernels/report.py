@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib import import_module
 from itertools import product
 
-from kornia_tidy.kernels.build import REALS, build, cache_folder, vector_bytes
+from kornia_tidy.kernels.build import KERNELS, REALS, build, cache_folder, vector_bytes
 from kornia_tidy.kernels.compiler import find_compiler
 
-SOURCES = (
-    "gather_ops",
-    "overlap_ops",
-    "occlusion_ops",
-    "mutual_intensity_ops",
-    "scattered_ops",
-    "srgb_ops",
-    "sensor_ops",
-)
+SOURCES = sorted(KERNELS.glob("*.c"))
 
 
 def kernels_in_words() -> Iterator[tuple[str, str]]:
@@ -29,8 +20,7 @@ def kernels_in_words() -> Iterator[tuple[str, str]]:
         'compiler'
     """
     yield "compiler", _compiler()
-    sources = (import_module(f"kornia_tidy.kernels.{name}").SOURCE for name in SOURCES)
-    for source, dtype in product(sources, REALS):
+    for source, dtype in product(SOURCES, REALS):
         name = f"{source.name}, {str(dtype).removeprefix('torch.')}"
         built = build(source, dtype)
         if built.path is None or built.library is None:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kornia_tidy.kernels.operators import define
 from kornia_tidy.mode import recording_in_operator
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
@@ -26,9 +27,6 @@ _LENS = (
     " float[] defocus, float pixel_step, int window, float tolerance"
 )
 _TENSORS = 3
-
-torch.library.define("kornia_tidy::exact_psfs", f"({_LENS}) -> Tensor")
-torch.library.define("kornia_tidy::exact_psfs_gradients", f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]")
 
 
 def operator_psf_bank(
@@ -137,8 +135,6 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return *(next(found) if want else None for want in wanted), *rest
 
 
-torch.library.impl("kornia_tidy::exact_psfs", "default", _psfs)
-torch.library.register_fake("kornia_tidy::exact_psfs", _psfs_fake)
-torch.library.register_autograd("kornia_tidy::exact_psfs", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::exact_psfs_gradients", "default", _gradients)
-torch.library.register_fake("kornia_tidy::exact_psfs_gradients", _gradients_fake)
+_GRADIENTS = f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]"
+define("exact_psfs", f"({_LENS}) -> Tensor", _psfs, _psfs_fake, _backward, _keep, "default")
+define("exact_psfs_gradients", _GRADIENTS, _gradients, _gradients_fake, devices="default")

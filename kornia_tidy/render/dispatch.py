@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
+from kornia_tidy.kernels.operators import define
 from kornia_tidy.mode import Mode, recording_in_operator, torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.backend import Backend, Work, wants_gradient
@@ -209,9 +210,6 @@ _SCENE = (
 )
 _TENSORS = 5  # of a scene, which may have gradients
 
-torch.library.define("kornia_tidy::render_layers", f"({_SCENE}) -> Tensor")
-torch.library.define("kornia_tidy::render_layers_gradients", f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]")
-
 
 def _field(numbers: Sequence[int]) -> Field:
     rows, columns, down, across, top, left, cell, still = numbers
@@ -291,8 +289,7 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     return *(next(found) if want else None for want in wanted), *rest
 
 
-torch.library.impl("kornia_tidy::render_layers", "default", torch.no_grad()(_rendered))
-torch.library.register_fake("kornia_tidy::render_layers", _render_fake)
-torch.library.register_autograd("kornia_tidy::render_layers", _backward, setup_context=_keep)
-torch.library.impl("kornia_tidy::render_layers_gradients", "default", _gradients)
-torch.library.register_fake("kornia_tidy::render_layers_gradients", _gradients_fake)
+_computed = torch.no_grad()(_rendered)
+_GRADIENTS = f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]"
+define("render_layers", f"({_SCENE}) -> Tensor", _computed, _render_fake, _backward, _keep, "default")
+define("render_layers_gradients", _GRADIENTS, _gradients, _gradients_fake, devices="default")
