@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -9,7 +12,7 @@ from torch import Tensor
 from kornia_tidy import NoMask, TiDyOptics
 from kornia_tidy.camera import distorted
 from kornia_tidy.optics import Lens, Spectrum
-from tests.base import BaseTester
+from tests.base import BaseTester, shared
 
 PITCH = 8e-6
 NAMES = ("double-gauss-50mm", "triplet-50mm", "single-50mm")
@@ -46,6 +49,23 @@ class TestDistorted(BaseTester):
             landed = height + lens.lateral_colour(height, wavelength)
             expected = at * landed / pinhole
             self.assert_close(centroid(seen[channel], center), expected, rtol=0, atol=0.02)
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_feature_light_lands_where_an_independent_tracer_says(self, name):
+        """At a third, two thirds and all of the field, in each colour; without the warp up to 2.2 px beside it."""
+        tabled = name.removesuffix("-50mm").replace("-", "_")
+        known = json.loads(shared("lenses/distortion.json").read_text())[f"{tabled} s=595.0"]
+        lens = Lens.named(name, 17.6, 0.595, field=7.5e-3)
+        for part in ("0.333", "0.667", "1.000"):
+            height, row = 6.784e-3 * float(part), known[part]
+            pinhole = height / (1 + row["distortion_percent"] / 100) / PITCH / math.sqrt(2)
+            center = (round(pinhole), round(pinhole))
+            image = blob(pinhole, pinhole, (64, 64), center).expand(3, -1, -1)
+            seen, _ = distorted(camera(lens), image, torch.ones(1, 64, 64), field_center=center)
+            for channel, colour in enumerate(("610", "", "470")):
+                lateral = row["lateral_um"].get(colour, 0.0) * 1e-6
+                landed = torch.full((2,), (height + lateral) / PITCH / math.sqrt(2), dtype=torch.float64)
+                self.assert_close(centroid(seen[channel], center), landed, rtol=0, atol=0.02)
 
     def test_feature_seidel_distortion_in_closed_form(self):
         """5 % at a height of 4 mm, growing with the square of the height."""
