@@ -55,15 +55,21 @@ class Pool:
 POOLS = {
     "training": Pool(48, (5.0, 50.0), (2.5e-6, 9e-6), FAMILIES),
     "sharp": Pool(16, (5.0, 16.0), (5e-6, 9.5e-6), ("flat",)),  # as those above, for training
+    "lenses": Pool(20, (5.0, 30.0), (2.5e-6, 9e-6), ("flat",)),
+    "slow": Pool(12, (25.0, 50.0), (2.5e-6, 9e-6), FAMILIES),
     "validation": Pool(8, (4.5, 55.0), (2.2e-6, 9.5e-6), FAMILIES, hard=3),
     "test": Pool(12, (4.0, 60.0), (2e-6, 10e-6), (*FAMILIES, "cubic", "fresnel"), hard=5),
 }
 
+BESIDE_TRAINING = ("sharp", "lenses", "slow")
+
 
 def pool_names(pool: str) -> list[str]:
-    """Return the names of the cameras of a pool; of training: shipped ones, drawn ones, sharp ones."""
+    """Return the names of the cameras of a pool; of training: shipped ones, drawn ones, sharp ones, others."""
     drawn = [f"{pool}-{index:02d}" for index in range(POOLS[pool].count)]
-    return [*SHIPPED, *drawn, *pool_names("sharp")] if pool == "training" else drawn
+    if pool != "training":
+        return drawn
+    return [*SHIPPED, *drawn, *(name for other in BESIDE_TRAINING for name in pool_names(other))]
 
 
 def own_system(name: str) -> TrainedSystem:

@@ -34,7 +34,7 @@ from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.noisy_crops import random_gain
 from kornia_tidy.training.task_loss import psnr_ssim_loss
-from tests.benchmarks.any_camera.cameras import SHIPPED, camera, pool_names
+from tests.benchmarks.any_camera.cameras import SHIPPED, camera, own_system, pool_names
 from tests.benchmarks.any_camera.captures import LEVELS, stored
 
 CROP = 128  # px
@@ -43,11 +43,11 @@ ELECTRONS = (200.0, 100_000.0)  # of white, uniform in their logarithm
 READ_ELECTRONS = (1.0, 5.0)
 NOISE_ERROR = 1.5  # largest factor by which the noise told is wrong
 BITS = (8, 10, 12, 14, 16)
-RATE, WARM_UP = 3e-4, 50
-DECAY = 0.995
+RATE, WARM_UP = 5e-4, 50
+DECAY = 0.998
 SHIPPED_SHARE = 0.25
 START = "edof-5"
-SAVED_EVERY = 50  # steps
+SAVED_EVERY = 100  # steps
 
 
 OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
@@ -56,9 +56,11 @@ LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors: of lengths; of the mask, in r
 DEMOSAICED = 0.2  # share of draws behind a Bayer filter
 GRAINY = 0.4  # share of draws whose scene has grain, which the optics blur and a network should keep
 COMPRESSED, QUALITIES, TOLD_AS_JPEG = 0.1, (85, 98), 0.006  # share of draws as JPEG; its quality; a noise told for it
-LOSS_OF_HARM = 1.0  # of a picture that is worse than the closed form's, beside its loss: for each decibel behind
+LOSS_OF_HARM = 2.0  # of a picture that is worse than the closed form's, beside its loss: for each decibel behind
 COLLAGES = 0.5  # share of draws of collages of photographs, where there are any
-PULL = 3e-4  # of the weights towards the first ones, for each step at the full rate
+PULL = 1e-4  # of the weights towards the first ones, for each step at the full rate
+TEACHERS = ("edof-5", "edof-designed", "edof-flat")  # cameras with networks of their own that are better
+TAUGHT = 0.5  # share of the own network's picture in the truth, behind such a camera whose capture is not disturbed
 
 
 class Cameras:
@@ -67,6 +69,7 @@ class Cameras:
     def __init__(self, folder: Path, pool: str) -> None:
         self.folder, self.names = folder, pool_names(pool)
         self.forms: dict[tuple[str, int], RuledClosedForm] = {}
+        self.teachers = {name: own_system(name).head.eval() for name in TEACHERS}
 
     def form(self, name: str, mistake: int = 0) -> RuledClosedForm:
         """Return the closed form of a camera, or of one that differs by small errors, numbered from 1."""
@@ -194,6 +197,11 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
         largest = largest_share(form, found.noise).expand(-1, 1, *capture.shape[-2:])
         truth = linear_rgb_to_rgb((image * gain).clamp(0, 1))
         known = (noisy < CLIPPED).all(1, keepdim=True)
+        disturbed = chance[0] < OVEREXPOSED or chance[2] < DEMOSAICED or chance[5] < COMPRESSED or chance[3] < MISTAKEN
+        if name in TEACHERS and not disturbed:
+            with torch.autocast("cpu", torch.bfloat16):
+                taught = cameras.teachers[name](capture, noise=told).float().clamp(0, 1)
+            truth = truth.lerp(taught, TAUGHT)
         parts.append((restored.image, restored.maps, truth, known, largest))
     whole = [torch.cat(part) for part in zip(*parts, strict=True)]
     turns, mirrored = int(torch.randint(4, (), generator=random)), bool(torch.randint(2, (), generator=random))
@@ -237,7 +245,9 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
             falling = 0.5 * (1 + math.cos(math.pi * step / steps))
             group["lr"] = RATE * min(1, (step + 1) / WARM_UP) * (0.05 + 0.95 * falling)
         first, maps, truth, known, largest = batch(cameras, step)
-        estimate = corrected(first, network(maps.contiguous(memory_format=torch.channels_last)), largest)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network(maps.contiguous(memory_format=torch.channels_last)).float()
+        estimate = corrected(first, found, largest)
         each, without = losses(estimate, truth, known), losses(first, truth, known)
         loss = (each + LOSS_OF_HARM * (each - without).clamp(min=0)).mean()
         optimizer.zero_grad()
