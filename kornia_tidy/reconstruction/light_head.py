@@ -161,7 +161,8 @@ def reconstruct_light(
     check_float_tensor("light", light, 3, "(3, H, W) or (1, H, W)")
     if light.shape[0] not in {1, 3} or 0 in light.shape:
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
-    light, _, notes = check_capture(light, _told_noise(head))
+    light, _, notes, least = check_capture(light, _told_noise(head))
+    head = _with_least_noise(head, least, float(light.mean()))
     colours = light.expand(3, -1, -1)[None]
     if head.field is not None:
         return Reconstruction(_over_field(head, colours, *head.field, progress)[0], None, notes)
@@ -181,6 +182,16 @@ def reconstruct_light(
     deviation = named["deviation"]
     in_metres = deviation_in_metres(head.camera, near, deviation)
     return UncertainReconstruction(image, metres(head.camera, near), in_metres, deviation, notes)
+
+
+def _with_least_noise(head: LightHead, least: float, level: float) -> LightHead:
+    """Return a head that takes the noise of its sensor for even noise, at least so much; itself where it is told."""
+    if not least or head.noise is not None or (told := _told_noise(head)) is None:
+        return head
+    copied = cast("LightHead", shared_copy(head))
+    copied.field = head.field
+    copied.noise = max(least, told.std(level))
+    return copied
 
 
 def _over_field(

@@ -59,6 +59,8 @@ class Settings(NamedTuple):
     """Of the kernel between Wiener's by rising noise and Tikhonov's by falling weight, (B, 1, 1, 1)."""
     color: Tensor
     """Width of the bilateral filter in colour, (B, 1, 1, 1); 0 for none."""
+    detail: Tensor
+    """Power of the scene's fine detail over that of photographs behind this camera, (B, 1, 1, 1), without bounds."""
 
 
 class RuledClosedForm(ClosedForm):
@@ -234,7 +236,8 @@ class RuledClosedForm(ClosedForm):
         place = cost.argmin(1)[:, None, None, None].to(light) / STEPS
         squares = [part.square().nan_to_num().mean((1, 2, 3), keepdim=True) for _, part in windows]
         even = torch.stack(squares).mean(0).sqrt().clamp(min=LEAST_NOISE)
-        return Settings(even, place, self._color_of_least_risk(windows, place))
+        ratio = (power / slope.clamp(min=torch.finfo(slope.dtype).tiny))[:, None, None, None]
+        return Settings(even, place, self._color_of_least_risk(windows, place), ratio)
 
     def _is_of_sensor(self, light: Tensor, noise: Tensor) -> bool:
         """Return whether the noise of a tile without stray light is that of the sensor, and no other that was told."""

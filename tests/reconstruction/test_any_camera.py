@@ -25,8 +25,8 @@ def head_of(dtype=torch.float32, *, trained=False):
     return head
 
 
-def share_of(head, noise):
-    return largest_share(head.closed_form, torch.full((1, 1, 1, 1), noise, dtype=head.closed_form.norms.dtype))
+def share_of(head, capture, noise):
+    return largest_share(head.closed_form, head.closed_form.settings_of(capture, noise))
 
 
 class TestAnyCameraHead(BaseTester):
@@ -44,7 +44,7 @@ class TestAnyCameraHead(BaseTester):
                 head.network.last.bias[0] = logit
                 found.append(head(capture, 0.01))
             correction = head.network(restored.maps)[:, 1:]
-            correction = share_of(head, 0.01) * correction
+            correction = share_of(head, capture, 0.01) * correction
         self.assert_close(found[0], restored.image)
         self.assert_close(found[1], restored.image + correction)
         assert correction.abs().max() > 1e-3
@@ -55,9 +55,17 @@ class TestAnyCameraHead(BaseTester):
         psfs = torch.zeros(7, 3, 5, 5, dtype=torch.float64)
         psfs[..., 2, 2] = 1
         head.closed_form.set_psfs(PSFBank.from_measured(psfs, torch.arange(7.0, dtype=torch.float64)))
-        small, large = (share_of(head, noise) for noise in (0.001, 0.1))
+        capture = torch.rand(1, 3, 32, 32, dtype=torch.float64)
+        small, large = (share_of(head, capture, noise) for noise in (0.001, 0.1))
         assert 0 <= small < 0.1
         assert large == MOST
+
+    def test_feature_the_softer_the_scene_the_smaller_is_the_share(self):
+        """Beyond a sixteenth of the detail of photographs it does not change."""
+        head, random = head_of(torch.float64), torch.rand(1, 3, 64, 64, dtype=torch.float64)
+        soft, sharp, sharper = (share_of(head, 0.5 + contrast * (random - 0.5), 1e-4) for contrast in (1e-3, 0.5, 1.0))
+        assert 0 < soft < 0.5 * sharp
+        assert sharp == sharper
 
     def test_feature_weights_of_one_camera_give_their_correction_times_the_share(self):
         """With the maps of the ruled closed form: the network of one camera sees the first of them."""
@@ -70,7 +78,7 @@ class TestAnyCameraHead(BaseTester):
             restored = head.closed_form(capture, 0.01)
             correction = own.network(restored.maps[:, : closed_form_channels(7)])
             share = torch.tensor(SHARE).sigmoid().double()
-            share = share * share_of(head, 0.01)
+            share = share * share_of(head, capture, 0.01)
             self.assert_close(head(capture, 0.01), restored.image + share * correction, rtol=1e-6, atol=1e-7)
 
     def test_exception_no_psfs(self):

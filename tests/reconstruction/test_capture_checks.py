@@ -13,6 +13,7 @@ from kornia_tidy.data import photographic_leaves
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import (
     JPEG,
+    JPEG_NOISE,
     MeasuredNoise,
     blockiness,
     check_capture,
@@ -71,6 +72,12 @@ class TestRepairOutliers(BaseTester):
         assert (repaired.light == 0.2).all()
 
 
+def jpeg(light, quality):
+    pixels = (linear_rgb_to_rgb(light[None])[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
+    read = cv2.imdecode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
+    return rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)[0]
+
+
 class TestMeasureNoise(BaseTester):
     @pytest.mark.parametrize("electrons", [300.0, 3000.0, 50_000.0])
     def test_feature_within_a_tenth_of_the_sensor(self, electrons):
@@ -99,11 +106,22 @@ class TestCheckCapture(BaseTester):
     @pytest.mark.parametrize("quality", [80, 92])
     def test_feature_jpeg(self, quality):
         light, sensor = capture()
-        pixels = (linear_rgb_to_rgb(light[None])[0].permute(1, 2, 0).numpy() * 255).round().astype(np.uint8)
-        read = cv2.imdecode(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
-        compressed = rgb_to_linear_rgb(torch.from_numpy(read).permute(2, 0, 1)[None].float() / 255)[0]
-        assert any("JPEG" in note for note in check_capture(compressed, told(sensor)).notes)
+        compressed = jpeg(light, quality)
+        checked = check_capture(compressed, told(sensor))
+        assert any("JPEG" in note for note in checked.notes)
+        assert checked.least_noise > float(sensor.std(light).mean())
+        assert check_capture(light, told(sensor)).least_noise == 0
         assert blockiness(compressed[:, 3:, 5:]) > JPEG > blockiness(light)  # wherever the blocks begin
+
+    def test_feature_jpeg_counts_as_noise_unless_more_is_told(self):
+        optics = TiDyOptics(fidelity="draft", sensor=SensorNoise(2.4 / 20_000, full_well=20_000.0))
+        system = any_camera_system(optics)
+        compressed = jpeg(capture(side=128)[0], 80)
+        found, by_least, more = (
+            reconstruct_light(LightHead(system, noise), compressed).image for noise in (None, JPEG_NOISE, 0.02)
+        )
+        self.assert_close(found, by_least)
+        assert (found - more).abs().max() > 1e-3
 
     def test_feature_encoded_light(self):
         light, sensor = capture()

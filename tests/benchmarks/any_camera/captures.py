@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -15,6 +16,7 @@ from torch import Tensor
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.photo_collages import grain, photo_collage
+from kornia_tidy.data.image_files import read_image
 from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.seeds import keyed_seed
@@ -23,6 +25,8 @@ from tests.benchmarks.any_camera.cameras import SHIPPED, camera, pool_names
 SIDE = 192  # px of a scene
 SCENES, SCENES_OF_SHIPPED = 32, 96
 LEVELS = 2**16 - 1
+STRIDE = 12  # between cameras whose captures are made one after the other, so that each kind comes early
+LEAVES_OF_PICTURES = 0.4  # share of photographs with the depth of leaves
 KINDS = ("leaves", "leaves", "leaves", "grain", "soft", "blank", "sharp")  # as often
 
 
@@ -92,6 +96,45 @@ def photograph_collages(folder: Path, photographs: Sequence[str], scenes: int = 
             seen.append(photographed(optics, scene, 1 / depth))
             shown.append(rgb_to_linear_rgb(scene[None])[0])
         _write({image: shown, light: seen})
+
+
+def photograph_pictures(folder: Path, photographs: Sequence[Path], scenes: int = 10) -> None:
+    """Make captures of whole photographs by the cameras of training, those of shipped systems first; of these more."""
+    names = pool_names("training")
+    for name in [*SHIPPED, *(one for first in range(STRIDE) for one in names[len(SHIPPED) + first :: STRIDE])]:
+        light, image = (folder / f"{name}-photographs-{part}.npy" for part in ("light", "image"))
+        if light.exists():
+            continue
+        optics, seen, shown = camera(name), [], []
+        for index in range(3 * scenes if name in SHIPPED else scenes):
+            scene, near = pictured_scene(photographs, keyed_seed(f"{name} photographs", index))
+            seen.append(photographed(optics, scene, near))
+            shown.append(rgb_to_linear_rgb(scene[None])[0])
+        _write({image: shown, light: seen})
+        print(name, flush=True)
+
+
+def pictured_scene(photographs: Sequence[Path], seed: int, side: int = SIDE) -> tuple[Tensor, Tensor]:
+    """Return a part of a photograph on a plane: sRGB (3, H, W), and its normalised inverse depth (1, H, W).
+
+    The plane is tilted at random; in four of ten scenes it is the depth of painted leaves, which does not follow from
+    the picture. A photograph is reduced in linear light to 1 to 1/3 of its sides, as its size allows.
+    """
+    rng = np.random.default_rng(seed)
+    light = rgb_to_linear_rgb(read_image(photographs[rng.integers(len(photographs))])[None, :3])[0]
+    largest = min(light.shape[-2:]) / side
+    factor = min(3.0, largest) ** rng.random() if largest > 1 else largest
+    size = [max(side, round(length / factor)) for length in light.shape[-2:]]
+    reduced = cv2.resize(light.permute(1, 2, 0).numpy(), size[::-1], interpolation=cv2.INTER_AREA)
+    top, left = (int(rng.integers(length - side + 1)) for length in size)
+    part = torch.from_numpy(np.ascontiguousarray(reduced[top : top + side, left : left + side].transpose(2, 0, 1)))
+    image = linear_rgb_to_rgb(part[None].clamp(0, 1))[0]
+    if rng.random() < LEAVES_OF_PICTURES:
+        return image, 1 / dead_leaves(side, side, depth_range=(1.0, float("inf")), seed=seed)[1]
+    angle, (first, last) = 2 * np.pi * rng.random(), rng.random(2)
+    down, across = np.mgrid[:side, :side] / side - 0.5
+    place = 0.5 + (np.cos(angle) * down + np.sin(angle) * across) / np.sqrt(2)
+    return image, torch.from_numpy((first + (last - first) * place)[None].astype(np.float32))
 
 
 def _write(parts: Mapping[Path, list[Tensor]]) -> None:

@@ -96,7 +96,7 @@ def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, t
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
         chosen = own.form.settings_of(capture, noise)
-        restored, largest = own.form.restore_by(capture, chosen), largest_share(own.form, chosen.noise)
+        restored, largest = own.form.restore_by(capture, chosen), largest_share(own.form, chosen)
         images = {"rule": restored.image}
         images |= {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:

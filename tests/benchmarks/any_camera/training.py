@@ -43,7 +43,7 @@ ELECTRONS = (200.0, 100_000.0)  # of white, uniform in their logarithm
 READ_ELECTRONS = (1.0, 5.0)
 NOISE_ERROR = 1.5  # largest factor by which the noise told is wrong
 BITS = (8, 10, 12, 14, 16)
-RATE, WARM_UP = 5e-4, 50
+RATE, WARM_UP = 2e-4, 50
 DECAY = 0.998
 SHIPPED_SHARE = 0.25
 START = "edof-5"
@@ -54,13 +54,13 @@ OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which
 MISTAKEN, MISTAKES = 0.35, 1  # share of draws with PSFs of a camera that is a little different; kinds of each camera
 LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors: of lengths; of the mask, in radii of the pupil; of focus, in radians
 DEMOSAICED = 0.2  # share of draws behind a Bayer filter
-GRAINY = 0.4  # share of draws whose scene has grain, which the optics blur and a network should keep
-COMPRESSED, QUALITIES, TOLD_AS_JPEG = 0.1, (85, 98), 0.006  # share of draws as JPEG; its quality; a noise told for it
+GRAINY = 0.2  # share of draws whose scene has grain, which the optics blur and a network should keep
+COMPRESSED, QUALITIES, TOLD_AS_JPEG = 0.1, (85, 98), 0.006  # share of draws as JPEG; quality; noise told for half
 LOSS_OF_HARM = 2.0  # of a picture that is worse than the closed form's, beside its loss: for each decibel behind
-COLLAGES = 0.5  # share of draws of collages of photographs, where there are any
-PULL = 1e-4  # of the weights towards the first ones, for each step at the full rate
+KINDS = {"-photographs": 0.6, "-collages": 0.25, "": 0.15}  # share of draws of captures, where there are such
+PULL = 5e-4  # of the weights towards the first ones, for each step at the full rate
 TEACHERS = ("edof-5", "edof-designed", "edof-flat")  # cameras with networks of their own that are better
-TAUGHT = 0.5  # share of the own network's picture in the truth, behind such a camera whose capture is not disturbed
+TAUGHT = 0.7  # share of the own network's picture in the truth, behind such a camera whose capture is not disturbed
 
 
 class Cameras:
@@ -82,9 +82,9 @@ class Cameras:
 
     def crops(self, name: str, count: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return noise-free crops of captures and scenes in linear light."""
-        collages = self.folder / f"{name}-collages-light.npy"
-        drawn = float(torch.rand((), generator=random)) < COLLAGES and collages.exists()
-        captures = stored(self.folder, f"{name}-collages" if drawn else name)
+        kinds = [kind for kind in KINDS if (self.folder / f"{name}{kind}-light.npy").exists()]
+        kind = kinds[int(torch.tensor([KINDS[kind] for kind in kinds]).multinomial(1, generator=random))]
+        captures = stored(self.folder, name + kind)
         side, found = captures.light.shape[-1], []
         for _ in range(count):
             index = int(torch.randint(len(captures.light), (), generator=random))
@@ -194,7 +194,7 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
         capture = linear_rgb_to_rgb(noisy)
         found = form.settings_of(capture, told)
         restored = form.restore_by(capture, found)
-        largest = largest_share(form, found.noise).expand(-1, 1, *capture.shape[-2:])
+        largest = largest_share(form, found).expand(-1, 1, *capture.shape[-2:])
         truth = linear_rgb_to_rgb((image * gain).clamp(0, 1))
         known = (noisy < CLIPPED).all(1, keepdim=True)
         disturbed = chance[0] < OVEREXPOSED or chance[2] < DEMOSAICED or chance[5] < COMPRESSED or chance[3] < MISTAKEN
@@ -240,10 +240,11 @@ def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
         optimizer.load_state_dict(state["optimizer"])
         step, log = state["step"], state["log"]
     began = time.monotonic()
+    began_at = step
     while step < steps and time.monotonic() - began < 60 * minutes:
         for group in optimizer.param_groups:
             falling = 0.5 * (1 + math.cos(math.pi * step / steps))
-            group["lr"] = RATE * min(1, (step + 1) / WARM_UP) * (0.05 + 0.95 * falling)
+            group["lr"] = RATE * min(1, (step - began_at + 1) / WARM_UP) * (0.05 + 0.95 * falling)
         first, maps, truth, known, largest = batch(cameras, step)
         with torch.autocast("cpu", torch.bfloat16):
             found = network(maps.contiguous(memory_format=torch.channels_last)).float()
