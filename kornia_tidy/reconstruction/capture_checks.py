@@ -218,7 +218,7 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
         notes.append(f"its noise is {found:.2g} of full scale, {factor:.0f} times what is told: give noise={found:.2g}")
     blocks = blockiness(middle) > JPEG
     if blocks:
-        notes.append(f"it shows the blocks of JPEG, which counts as a noise of {JPEG_NOISE}: rather restore the raw file")
+        notes.append(f"it shows the blocks of JPEG, taken for a noise of {JPEG_NOISE}: rather restore the raw file")
     elif noise.rise < FALLING * noise.dark:
         notes.append(
             "its noise falls with light, as in pictures that are encoded or tone-mapped: give it as sRGB, or develop "

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.data.photo_collages import grain, photo_collage
 from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data.photo_collages import grain, photo_collage
 from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.seeds import keyed_seed
