@@ -63,6 +63,7 @@ copybutton_prompt_is_regexp = True
 linkcheck_anchors = False  # pages of GitHub make theirs in the browser
 linkcheck_timeout = 20
 
+BACK = re.compile(r'(<a class="viewcode-back" href="[^"#]*#)([^"]*)(">.*?</a>)')  # from a source to its description
 EXAMPLE = re.compile(r"\(((?:\.\./)*)examples/(\w+)\.py\)")
 
 
@@ -86,16 +87,27 @@ def shorten_factories(
     return signature and signature.replace("<factory>", "..."), returned
 
 
-def drop_dead_links_of_sources(_app: object, env: Any) -> None:
-    """Drop pages of modules without source, and links of sources to descriptions that stand under another name."""
-    described = {name for name, _, _, _, anchor, _ in env.get_domain("py").get_objects() if name == anchor}
+def drop_modules_without_source(_app: object, env: Any) -> None:
+    """Drop pages of modules without source."""
     for module, entry in list(getattr(env, "_viewcode_modules", {}).items()):
         if not entry:
             del env._viewcode_modules[module]
-            continue
-        _, _, used, package = entry
-        for name in [name for name in used if f"{package}.{name}" not in described]:
-            del used[name]
+
+
+def mend_links_of_sources(app: Any, page: str, _template: str, context: dict[str, Any], _doctree: object) -> None:
+    """Let links of sources lead to descriptions under their own package: viewcode takes one for a whole module."""
+    entry = getattr(app.env, "_viewcode_modules", {}).get(page.removeprefix("_modules/").replace("/", "."))
+    if entry is None:
+        return
+    _, _, used, package = entry
+    described = {name: home for name, _, _, home, anchor, _ in app.env.get_domain("py").get_objects() if name == anchor}
+
+    def mended(link: re.Match[str]) -> str:
+        name = link[2].removeprefix(f"{package}.")
+        ours = [full for full, home in described.items() if home == used[name] and full.endswith(f".{name}")]
+        return f"{link[1]}{ours[0]}{link[3]}" if ours else ""
+
+    context["body"] = BACK.sub(mended, context["body"])
 
 
 def setup(app: Any) -> None:
@@ -106,6 +118,7 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", keep_sentences_of_properties, priority=400)
     app.connect("autodoc-process-signature", shorten_factories)
     app.connect("missing-reference", references.resolve)
-    app.connect("env-check-consistency", drop_dead_links_of_sources)
+    app.connect("env-check-consistency", drop_modules_without_source)
+    app.connect("html-page-context", mend_links_of_sources)
     app.add_directive("mermaid", drawn_in_page.FlowChart)
     app.add_html_math_renderer("mathml", (drawn_in_page.visit_inline, None), (drawn_in_page.visit_block, None))
