@@ -131,8 +131,8 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         - ``augmentation(image)`` inside a container: behind ``augmentation.depth_tap``, or with :func:`bound_depth`.
 
     Convention:
-        - The depth that comes out of a container of kornia has its holes still, moved with it: behind the container
-          ``depth, valid = kornia_tidy.data.fill_holes(depth)`` gives both.
+        - A container of kornia returns the depth with its holes, warped with it. Call
+          ``depth, valid = kornia_tidy.data.fill_holes(depth)`` on what it returns.
     """
 
     def __init__(

@@ -31,7 +31,8 @@ from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, PITCHES
+from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, PITCHES, ThinLensCamera
+from kornia_tidy.optics.units import misread_depth, warn_once
 from kornia_tidy.render.compositing import render
 
 _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
@@ -365,7 +366,17 @@ class RandomDepthBlur(DepthAugmentation):
         """Return blurred images. See :meth:`DepthAugmentation.change`."""
         if self.optics is not None:
             return self.optics(image, depth, field_center=params["field_center"])
+        if Mode.GRAPH not in torch_mode():
+            _warn_of_unit(depth.detach())
         return depth_blur(image, depth, params["focus_distance"], params["f_number"], **self.flags)
+
+
+def _warn_of_unit(depth: Tensor) -> None:
+    """Warn once of depths that are probably not in metres, as the default camera does."""
+    usual, (nearest, farthest) = ThinLensCamera(), torch.aminmax(depth)
+    said = misread_depth(usual, *usual.defocus(torch.stack([farthest, nearest]).float().cpu()))
+    if said is not None:
+        warn_once(None, "unit of depth in RandomDepthBlur", said, stacklevel=2)
 
 
 _DISCS = {"focus_distance": (0.5, 5.0), "f_number": (2.0, 16.0), "focal_length": 50e-3, "max_radius": 16.0}

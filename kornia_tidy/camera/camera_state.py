@@ -219,7 +219,7 @@ class CameraState(nn.Module):
         return self._replace(psf_model=self.psf_model.through_moment(moment))
 
     def with_bank(self, bank: PSFBank | FieldBank) -> Self:
-        """Return this camera with PSFs that were measured in the place of its masks'. The other parts are shared.
+        """Return this camera with measured PSFs instead of those of its masks. The other parts are shared.
 
         Args:
             bank: with the channels of the spectrum. Other depths than it holds are seen as the nearest of them. Of one

@@ -101,7 +101,7 @@ def moving_capture(
 
 
 def moment_times(optics: TiDyOptics) -> Tensor:
-    """Return when each moment of the exposure is: its middle, as a share of the exposure in [0, 1].
+    """Return the middle of each moment of the exposure, as a share of the exposure in [0, 1].
 
     Args:
         optics: the camera. Moments are those of :meth:`~kornia_tidy.psf.psf_model.PSFModel.timeline`; the states

@@ -49,7 +49,7 @@ COMMANDS: Commands = {
 }
 """Commands by name: module and class, or the commands of a group."""
 ABOUT = {
-    "masks": "Masks -> SLM frames, heights; and back.",
+    "masks": "Turn masks into SLM frames or heights, and frames back into masks.",
     "raw": "Camera raw files: what they hold, pictures of them, calibrations, reconstructions.",
 }
 """What the groups do."""

@@ -341,7 +341,7 @@ class DefocusRange(nn.Module):
         lo: defocus in radians at a disparity of 0.
         hi: defocus in radians at a disparity of 1.
         camera: aperture, image distance and pixel pitch of the PSFs. Default: :class:`ThinLensCamera`.
-        lens: the old word for ``camera``, with a warning.
+        lens: deprecated name of ``camera``, with a warning.
 
     Raises:
         ValueError: if ``lo`` is not below ``hi``, or both words are given.

@@ -123,6 +123,15 @@ class TestDepthBlur(BaseTester):
 
 
 class TestRandomDepthBlur(BaseTester):
+    def test_feature_millimetres_are_told_once_and_metres_are_not(self, monkeypatch, device):
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        image, depth = torch.rand(1, 3, 40, 40, device=device), torch.linspace(0.3, 9.0, 1600, device=device)
+        blur, metres = RandomDepthBlur(p=1.0), depth.view(1, 1, 40, 40)
+        blur(image, metres)  # warnings are errors
+        with pytest.warns(UserWarning, match=r"300 m away.*are these millimetres\? Multiply depth by 0.001"):
+            blur(image, 1000 * metres)
+        blur(image, 1000 * metres)
+
     def test_feature_is_the_function_with_the_drawn_lens(self):
         image, depth = scene(3)
         augmentation = RandomDepthBlur(p=1.0, **LENS)

@@ -48,9 +48,9 @@ class ModulatorSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Design aperture, focus and masks together; do masks pay?
+    """Design aperture, focus and masks together, and see whether masks pay.
 
-    For extended depth of field, for depth, or for both. A wide aperture with masks gets
+    The aim is extended depth of field, depth, or both. A wide aperture with masks gets
     more light, a lens that is stopped down is sharper over a larger range of depths: which
     of the two is ahead depends on the light and on the range of depths.
 

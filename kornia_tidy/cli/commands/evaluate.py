@@ -17,7 +17,7 @@ from kornia_tidy.training.settings import SceneSettings, TrainingSettings
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate:
-    """Error measures of a trained system.
+    """Measure the errors of a trained system.
 
     A trained camera and network, or the closed form of a camera that was measured, is
     evaluated on scenes that were not used for training. With --psfs and --noise the captures are

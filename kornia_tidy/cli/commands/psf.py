@@ -40,7 +40,7 @@ def depths_of(text: str) -> tuple[float, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Psf:
-    """PSFs of a camera over depth and colour, and over the field of a lens.
+    """Draw a camera's PSFs over depth and colour, and over the field of a lens.
 
     Draws a montage of the point spread functions (PSFs) over depth and colour, a slice
     through focus, and the modulation transfer function (MTF). CAMERA is the name of a

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratePsf:
-    """Pictures of a point -> PSF bank.
+    """Make a PSF bank from pictures of a point.
 
     The pictures show a point of light at known distances.
     At each distance the point is moved by some pixels and fractions of a pixel between

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructRaw:
-    """All-in-focus pictures and depth of captures.
+    """Restore captures: pictures that are sharp everywhere, and depth.
 
-    By a trained network, or by a closed form for a camera that was measured or is given by
-    lens and masks, tile by tile within a memory budget and without visible seams.
+    A trained network restores them, or a closed form for a camera that was measured or is
+    given by lens and masks: tile by tile, within a memory budget, without visible seams.
     FILES are camera raw files or pictures (PNG, TIFF, JPEG, NPY). For each FILE, FOLDER gets
       FILE.png, FILE.jpg      the picture all in focus, 16 bits, and to look at
       FILE_depth.png          depth, 16 bits, in multiples of --depth-unit

@@ -51,7 +51,7 @@ class SensorOptions(SensorInElectrons):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRaw:
-    """Picture + depth -> raw file.
+    """Make a raw file from a picture and its depth.
 
     The scene is a picture with a depth map of the same size. It is blurred by the lens with
     its K phase masks, sampled through the filter array, and recorded with the camera's

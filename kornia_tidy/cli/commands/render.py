@@ -48,7 +48,7 @@ class Files:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Data set -> coded captures on disk.
+    """Photograph a data set and store its coded captures.
 
     Every scene of a data set is photographed once through a camera with phase masks, and
     the captures are stored for training. The camera is given by the options below, a

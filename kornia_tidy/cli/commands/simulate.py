@@ -14,7 +14,7 @@ from kornia_tidy.settings import Seed, Unit, one_of
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Picture + depth -> coded capture.
+    """Make the coded capture of a picture and its depth.
 
     The camera shows its K phase masks one after another during one exposure. The scene is
     a picture and a depth map of the same size. Masks of random height have 23 x 23 pixels:

@@ -32,7 +32,7 @@ def names_of(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class Systems:
-    """Nine published systems side by side.
+    """Compare nine published systems side by side.
 
     Lists them and draws, in one picture, their masks, point spread functions (PSF) and
     contrast (MTF) over depth, the Cramér-Rao bound on the depth of a point, and the capture

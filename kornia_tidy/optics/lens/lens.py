@@ -365,7 +365,7 @@ class Lens(nn.Module):
 
     @on_cpu
     def distortion(self, heights: Tensor, defocus: float = 0.0) -> Tensor:
-        """Return by how much images are larger than a pinhole at the entrance pupil makes them, (F,), as a part of 1.
+        """Return the distortion, (F,): the image height over that of a pinhole at the entrance pupil, less one.
 
         Args:
             heights: (F,) in metres from the axis, where light of 530 nm lands.
@@ -378,7 +378,7 @@ class Lens(nn.Module):
 
     @on_cpu
     def lateral_colour(self, heights: Tensor, wavelength: float, defocus: float = 0.0) -> Tensor:
-        """Return where light of a wavelength lands less where light of 530 nm does, in metres along the field, (F,).
+        """Return how much farther from the axis a wavelength lands than 530 nm, in metres, (F,).
 
         Args:
             heights: (F,) in metres from the axis.
