@@ -27,8 +27,9 @@ def main() -> None:
     options = parser.parse_args()
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     command = [sys.executable, "-m", "kornia_tidy", "app", "--port", "7864"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as app, sync_playwright() as playwright:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as app, sync_playwright() as playwright:  # noqa: S603
         try:
+            assert app.stdout is not None
             address = app.stdout.readline().split()[-1]
             chromium = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
             screen = {"width": options.width, "height": options.width}
