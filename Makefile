@@ -8,7 +8,7 @@ DOCS_READY := $(VENV)/.docs-ready
 WHEEL_READY := $(VENV)/.wheel-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs wheel targets clean
+.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs wheel bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -25,6 +25,8 @@ help:
 	@echo "make docs     the site of the documentation, in outputs/site: minutes at first, for the examples of its gallery;"
 	@echo "              ARGS=--no-gallery runs none of them, ARGS=--linkcheck also asks the addresses of external links"
 	@echo "make wheel    a wheel in dist/ that needs no compiler: with the C sources compiled for each level of processors"
+	@echo "make bench    the benchmarks on tiny pictures, as outputs/benchmarks.json and .md;"
+	@echo "              KORNIA_TIDY_BENCH_SIZE=1024 make bench ARGS='-k capture' takes larger ones"
 	@echo "make targets  the figures that rendering is judged by, on a real scene: minutes, on an idle machine"
 	@echo "make clean    removes .venv, outputs and caches"
 	@echo
@@ -69,12 +71,19 @@ wheel: $(WHEEL_READY)
 	@KORNIA_TIDY_LIBRARIES=build/libraries $(BIN)/python -m build --wheel --no-isolation --outdir build/wheel
 	@PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist build/wheel/*.whl
 
+# The usual options of pytest leave the benchmarks out.
+bench: $(READY)
+	@mkdir -p outputs
+	@$(BIN)/python -m pytest -q --override-ini addopts= tests/benchmarks \
+		--benchmark-quiet --benchmark-json=outputs/benchmarks.json $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.table outputs/benchmarks.json | tee outputs/benchmarks.md
+
 # Memory that the C library gives back to the system is dear to fetch again, for every method alike: let it keep it.
 targets: $(READY)
 	@MALLOC_TRIM_THRESHOLD_=2000000000 MALLOC_MMAP_THRESHOLD_=2000000000 $(BIN)/python -m tests.benchmarks.targets
 
 clean:
-	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) outputs build dist .pytest_cache .ruff_cache .hypothesis .benchmarks
 	find kornia_tidy tests -name __pycache__ -prune -exec rm -rf {} +
 
 $(DOCS_READY): $(READY)
