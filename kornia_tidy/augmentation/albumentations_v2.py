@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import torch
 
+from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.camera.holes import both_valid, fills_holes
-from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part, unmasked
 from kornia_tidy.optics.holes import HOLES, fill_holes

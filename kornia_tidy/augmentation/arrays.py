@@ -12,6 +12,7 @@ from kornia.color import rgb_to_linear_rgb
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
 from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
 from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
@@ -20,7 +21,6 @@ from kornia_tidy.choices import REPLACED
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.camera_system import any_camera_system, saved_system, sensor_of
 from kornia_tidy.reconstruction.hub import from_pretrained
@@ -92,8 +92,8 @@ def simulate(
     """
     optics = lens_optics(optics, lens, _default_optics)
     check_choice("holes", holes, HOLES)
-    pixels = to_tensor(unmasked("image", image), color, light=optics.color_space == "linear")
-    metres = depth_to_tensor(depth, depth_scale)
+    pixels = _pixels(unmasked("image", image), color, light=optics.color_space == "linear")
+    metres = _metres(depth, depth_scale)
     if metres.shape[0] != pixels.shape[0] or metres.shape[-2:] != pixels.shape[-2:]:
         raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
     if fills_holes(optics, holes):
@@ -101,7 +101,7 @@ def simulate(
     generator = None if seed is None else torch.Generator().manual_seed(checked_seed(seed))
     with torch.no_grad():
         coded = optics(pixels, metres, generator=generator, field_center=field_center)
-    return to_array(coded, image.dtype, color, image.ndim)
+    return _like(coded, image, color)
 
 
 def reconstruct(
@@ -142,7 +142,7 @@ def reconstruct(
         >>> image.shape, depth
         ((32, 48, 3), None)
     """
-    pixels = to_tensor(unmasked("capture", capture), color)
+    pixels = _pixels(unmasked("capture", capture), color)
     check_positive("memory_budget", memory_budget, "bytes")
     if not len(pixels):
         raise ValueError(f"captures must be one or more, got shape {capture.shape}")
@@ -153,38 +153,23 @@ def reconstruct(
     found = [reconstruct_light(head, one, memory_budget=memory_budget) for one in light]
     images = [one.image for one in found if one.image is not None]
     depths = [one.depth[0] for one in found if one.depth is not None]
-    ndim = max(3, capture.ndim)  # a grey capture becomes an image of three channels too
+    like = capture[..., None] if capture.ndim == 2 else capture  # a grey capture too becomes an image of three channels
     near = torch.stack(depths).numpy() if depths else None
     return Reconstructed(
-        to_array(torch.stack(images), capture.dtype, color, ndim) if images else None,
+        _like(torch.stack(images), like, color) if images else None,
         near if near is None or capture.ndim == 4 else near[0],
     )
 
 
-def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) -> Tensor:
-    """Convert an array of images to a tensor (B, C, H, W) in RGB, float32; integers are scaled to [0, 1].
-
-    Args:
-        image: as for :func:`simulate`.
-        color: order of three channels.
-        light: whether floats above 1 are allowed, as linear light may be.
-
-    Raises:
-        TypeError: if it is not an array, or has another data type.
-        ValueError: if the shape or a value is not allowed.
-
-    Example:
-        >>> to_tensor(np.array([[[0, 51, 255]]], np.uint8)).flatten().tolist()
-        [1.0, 0.20000000298023224, 0.0]
-    """
+def _pixels(image: NDArray[Any], color: Color, light: bool = False) -> Tensor:
+    """Return images as a tensor (B, C, H, W) in RGB; floats above 1 are allowed in linear light."""
     check_choice("color", color, ("bgr", "rgb"))
     if not isinstance(image, np.ndarray) or image.dtype not in IMAGES:
         kind = image.dtype if isinstance(image, np.ndarray) else described(image)
         raise TypeError(f"image must be an array of uint8, uint16 or float32, got {kind}")
-    image = np.asarray(image)  # of a masked array, whose masked values a division in place would pass by
-    planes = {2: lambda: image[None, ..., None], 3: lambda: image[None], 4: lambda: image}
-    pixels = planes[image.ndim]() if image.ndim in planes else image
-    if pixels.ndim != 4 or pixels.shape[3] not in {1, 3} or 0 in pixels.shape[1:]:
+    image = np.asarray(image)
+    shape = (*image.shape, 1) if image.ndim == 2 else image.shape
+    if len(shape) not in {3, 4} or shape[-1] not in {1, 3} or 0 in shape[-3:]:
         raise ValueError(f"image must have shape {SHAPES}, got {image.shape}{_shape_remedy(image)}")
     if image.dtype == np.float32:
         lowest, highest = (float(image.min()), float(image.max())) if image.size else (0.0, 0.0)
@@ -192,58 +177,27 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
             remedy = ": divide by 255, or give uint8" if 1 < highest <= 255 and lowest >= 0 else ""
             limits = "be finite and not negative" if light else "lie in [0, 1]"
             raise ValueError(f"a float32 image must {limits}, found {lowest:.6g} to {highest:.6g}{remedy}")
-    if color == "bgr":
-        pixels = pixels[..., ::-1]
-    values = pixels.transpose(0, 3, 1, 2).astype(np.float32, order="C")
-    if image.dtype.kind == "u":
-        values /= np.iinfo(image.dtype).max
-    return torch.from_numpy(values)
+    pixels = image_tensor(image if color == "rgb" else image.reshape(shape)[..., ::-1])
+    return pixels if pixels.ndim == 4 else pixels[None]
 
 
-def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Tensor:
-    """Convert an array of depths to metres, (B, 1, H, W) float32; 0 where a masked array is masked.
-
-    Args:
-        depth: as for :func:`simulate`.
-        depth_scale: metres per unit. None: floats are metres.
-
-    Raises:
-        TypeError: if it is not an array of integers or floats.
-        ValueError: if the shape is not allowed, integers come without a scale, or it is units per metre.
-
-    Example:
-        >>> depth_to_tensor(np.array([[0, 500, 2000]], np.uint16), 0.001)
-        tensor([[[[0.0000, 0.5000, 2.0000]]]])
-    """
+def _metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
+    """Return depth maps in metres, (B, 1, H, W) float32; 0 where a masked array is masked."""
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
         kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
         raise TypeError(f"depth must be an array of integers or floats, got {kind}")
     depth = np.asarray(np.ma.filled(depth, 0))
+    maps = depth[..., None] if depth.ndim == 3 and depth.shape[2] != 1 else depth
     if depth.ndim not in {2, 3, 4} or 0 in depth.shape[-2:] or (depth.ndim == 4 and depth.shape[3] != 1):
         raise ValueError(f"depth must have shape (H, W) or (H, W, 1), or (B, H, W) or (B, H, W, 1), got {depth.shape}")
-    scale = metres_per_unit(depth_scale, depth.dtype.kind != "f", depth.dtype)
-    if depth.ndim == 2 or (depth.ndim == 3 and depth.shape[2] == 1):
-        maps = depth.reshape(1, *depth.shape[:2])
-    else:
-        maps = depth.reshape(depth.shape[:3])
-    check_depth_scale(scale, maps)
-    return torch.from_numpy((maps.astype(np.float64) * scale).astype(np.float32)[:, None])
+    metres = depth_tensor(maps, depth_scale).float()
+    return metres if metres.ndim == 4 else metres[None]
 
 
-def to_array(images: Tensor, dtype: np.dtype[Any], color: Color, ndim: int) -> NDArray[Any]:
-    """Convert images (B, C, H, W) to an array of a data type with 2, 3 (without batch) or 4 axes.
-
-    Example:
-        >>> to_array(torch.tensor([1.0, 0.5, 0.0]).view(1, 3, 1, 1), np.dtype(np.uint8), "bgr", 3).tolist()
-        [[[0, 128, 255]]]
-    """
-    values = images.detach().cpu().permute(0, 2, 3, 1).numpy()
-    if color == "bgr":
-        values = values[..., ::-1]
-    if dtype.kind == "u":
-        values = np.rint(values.astype(np.float64).clip(0, 1) * np.iinfo(dtype).max)
-    array = np.ascontiguousarray(values, dtype)
-    return array if ndim == 4 else array[0, ..., 0] if ndim == 2 else array[0]
+def _like(images: Tensor, array: NDArray[Any], color: Color) -> NDArray[Any]:
+    """Return images (B, C, H, W) in the layout, data type and colour order of an array."""
+    images = images if array.ndim == 4 else images[0]
+    return like_image(images.flip(-3) if color == "bgr" else images, array)
 
 
 @lru_cache(maxsize=4)

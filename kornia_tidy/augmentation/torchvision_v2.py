@@ -11,9 +11,9 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.camera.holes import fills_holes, with_filled
-from kornia_tidy.camera.image_types import depth_tensor, image_tensor, like_image
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_filled
-from kornia_tidy.camera.image_types import cropped_image, depth_tensor, filled_depth, image_tensor, like_image
+from kornia_tidy.arrays import cropped_image, depth_tensor, image_tensor, like_image
+from kornia_tidy.camera.holes import DEPTH_KEYS, filled_depth, fills_holes, with_filled
 from kornia_tidy.camera.samples import with_capture
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.optics.holes import HOLES
@@ -38,7 +38,7 @@ class DatasetTransform:
         - A tuple ``(image, depth, ...)``, or a mapping, such as a sample of MONAI or of a Hugging Face data set; a
           mapping of lists is a batch of them.
         - The image is a tensor (C, H, W), an array (H, W, C) or (H, W), or a PIL image, of floating-point, 8-bit or
-          16-bit numbers, see :func:`~kornia_tidy.camera.image_types.image_tensor`; the capture is of the same kind.
+          16-bit numbers, see :func:`~kornia_tidy.arrays.image_tensor`; the capture is of the same kind.
         - The depth is a tensor (1, H, W), an array (H, W) or a PIL image, and comes back as it was. Where holes are
           filled, it comes back filled, in its type, and a mapping gets ``"valid"`` of its kind, False in holes.
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
+import numpy as np
+from torch import Tensor
+
+from kornia_tidy.arrays import as_array
+from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
 
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
@@ -33,6 +39,23 @@ def fills_holes(optics: Any, holes: str = "error") -> bool:
             "its disparity before the call, and leave holes='error'"
         )
     return filled
+
+
+def filled_depth(depth: Any) -> tuple[Any, Any]:
+    """Fill the holes of a depth map as a tensor, an array or a PIL image. See :func:`kornia_tidy.data.fill_holes`.
+
+    Returns:
+        The depth in its kind, and where it was known: a tensor of bool for a tensor, else an array.
+
+    Example:
+        >>> import numpy as np
+        >>> filled_depth(np.array([[500, 0, 2000]], np.uint16))
+        (array([[ 500,  500, 2000]], dtype=uint16), array([[ True, False,  True]]))
+    """
+    if isinstance(depth, Tensor):
+        return fill_holes(depth if type(depth) is Tensor else depth.as_subclass(Tensor))
+    filled, valid = fill_holes(as_array("depth", depth))
+    return (filled if isinstance(depth, np.ndarray) else sys.modules["PIL.Image"].fromarray(filled)), valid
 
 
 def with_filled(sample: Any, depth: Any, valid: Any, names: Sequence[str] = DEPTH_KEYS) -> Any:

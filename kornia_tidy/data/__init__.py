@@ -5,12 +5,12 @@ unknown pixels goes through :func:`fill_holes`. ``scene_statistics.py`` has the 
 and how their depths are distributed, for mask design and the Wiener filter.
 """
 
+from kornia_tidy.arrays import to_opencv
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
 from kornia_tidy.data.depth_files import DepthMap, read_depth, write_depth
 from kornia_tidy.data.flying_things import FlyingThings3D, paper_patches, split_frames
 from kornia_tidy.data.image_files import read_image, write_image
 from kornia_tidy.data.nyu_depth import NYUDepthV2
-from kornia_tidy.data.opencv_arrays import to_opencv
 from kornia_tidy.data.patches import Patches, central_crop, crop, random_crop
 from kornia_tidy.data.photo_collages import PhotoCollages, photo_collage, photographs_in
 from kornia_tidy.data.photographic_leaves import PhotographicLeaves, photographic_leaves

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_tidy.arrays import check_depth_scale
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.data.metadata import with_text
 from kornia_tidy.data.orientation import tell_orientation
@@ -21,7 +22,7 @@ from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import replacing, write_bytes
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.optics.units import check_depth_scale, warn_once
+from kornia_tidy.optics.units import warn_once
 
 UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kornia_tidy.arrays import to_opencv
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.metadata import with_exif
-from kornia_tidy.data.opencv_arrays import to_opencv
 from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.stored import Stored, read_stored
 from kornia_tidy.files import write_bytes

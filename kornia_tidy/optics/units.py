@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Hashable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.arrays import FARTHEST
 
 if TYPE_CHECKING:
     from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
@@ -22,9 +21,7 @@ BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
 DARKEST_LIGHT = -1.0  # out-of-gamut colours are negative in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
 SAME_FOCUS = 0.5  # rad; lowers the peak of a PSF by only 2 % (1 - psi^2 / 12), so two depths look equally sharp
-FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millimetres reaches
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"))
-FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of several metres each
 
 _TOLD: set[Hashable] = set()  # warnings that were given in this process
 
@@ -153,60 +150,6 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
                 f"these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
             )
     return None
-
-
-def metres_per_unit(scale: float | None, whole: bool, kind: Any) -> float:
-    """Return the metres in one stored unit of a depth map: the scale, or 1 for floating-point numbers without one.
-
-    Args:
-        scale: metres per unit, or None.
-        whole: whether whole numbers are stored.
-        kind: their data type, for the message.
-
-    Raises:
-        ValueError: if whole numbers come without a scale, or it is not positive.
-
-    Example:
-        >>> metres_per_unit(None, False, "float32"), metres_per_unit(0.001, True, "uint16")
-        (1.0, 0.001)
-    """
-    if scale is None and whole:
-        raise ValueError(f"a depth of {kind} needs depth_scale, metres per unit, such as 0.001 for millimetres")
-    check_positive("depth_scale", 1.0 if scale is None else scale, "metres per unit")
-    return 1.0 if scale is None else float(scale)
-
-
-def check_depth_scale(scale: float, stored: np.ndarray) -> None:
-    """Raise if a scale is probably units for each metre, as in Open3D, TUM RGB-D and ROS, instead of metres per unit.
-
-    Two conditions must hold. A unit is more than a metre. The near pixels, at the lowest hundredth, are at 500 m
-    or farther, or at 100 km where values have fractions, as depth in kilometres does.
-
-    Args:
-        scale: metres for each stored unit.
-        stored: known values of a depth map, any shape; only positive and finite ones count.
-
-    Raises:
-        ValueError: if both hold.
-
-    Example:
-        >>> check_depth_scale(1000, np.array([700, 1500]))
-        Traceback (most recent call last):
-        ValueError: depth_scale is metres for each stored unit, and 1000 puts near pixels at 7e+05 m: for 1000 \
-units in a metre give 0.001, not 1000; for metres 1 (--depth-scale)
-        >>> check_depth_scale(1000, np.array([0.5, 2.25]))  # kilometres
-    """
-    if scale <= 1:
-        return
-    known = stored[(stored > 0) & np.isfinite(stored)]
-    if not known.size:
-        return
-    near = scale * float(np.quantile(known, 0.01, method="nearest"))
-    if near >= (FAR_WHOLE if bool((known == np.rint(known)).all()) else FARTHEST):
-        raise ValueError(
-            f"depth_scale is metres for each stored unit, and {scale:g} puts near pixels at {near:.3g} m: for "
-            f"{scale:g} units in a metre give {1 / scale:.6g}, not {scale:g}; for metres 1 (--depth-scale)"
-        )
 
 
 def layout_remedy(shape: tuple[int, ...], channels: int, name: str = "image") -> str:

@@ -10,9 +10,9 @@ import albumentations as A  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
+from kornia_tidy.arrays import depth_tensor, image_tensor  # noqa: E402
 from kornia_tidy.augmentation import RandomTiDyOptics  # noqa: E402
 from kornia_tidy.augmentation.albumentations_v2 import OpticsTransform  # noqa: E402
-from kornia_tidy.camera.image_types import depth_tensor, image_tensor  # noqa: E402
 from tests.base import BaseTester  # noqa: E402
 from tests.camera.pipeline_samples import camera, scene  # noqa: E402
 

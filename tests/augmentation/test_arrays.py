@@ -11,8 +11,7 @@ from safetensors.torch import save_file
 
 import kornia_tidy
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.augmentation.arrays import depth_to_tensor, to_array, to_tensor
-from kornia_tidy.camera.image_types import image_tensor
+from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
 from kornia_tidy.data import read_rgbd, to_opencv
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
@@ -192,7 +191,7 @@ class TestConversion(BaseTester):
     @pytest.mark.parametrize("kind", ["uint8", "uint16"])
     def test_feature_every_number_comes_back(self, kind):
         numbers = np.arange(MOST[kind] + 1, dtype=kind).reshape(2, -1)
-        assert (to_array(to_tensor(numbers), numbers.dtype, "bgr", 2) == numbers).all()
+        assert (like_image(image_tensor(numbers), numbers) == numbers).all()
 
     @pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float32, np.float64])
     @pytest.mark.parametrize("beneath", [0, 9, 65000, np.nan, -1, 1e20])
@@ -203,16 +202,15 @@ class TestConversion(BaseTester):
         values = np.array([[500, 0, 2000], [500, 500, 2000]], np.float64)
         values[0, 1] = beneath
         depth = np.ma.masked_array(values.astype(kind), mask=[[0, 1, 0], [0, 0, 0]], fill_value=777)
-        expected = torch.tensor([[[[0.5, 0.0, 2.0], [0.5, 0.5, 2.0]]]])
-        self.assert_close(depth_to_tensor(depth, 0.001), expected)
-        self.assert_close(depth_to_tensor(np.ma.masked_array(expected[0, 0].numpy())), expected)  # nothing is masked
+        expected = torch.tensor([[[0.5, 0.0, 2.0], [0.5, 0.5, 2.0]]])
+        self.assert_close(depth_tensor(depth, 0.001).float(), expected)
+        self.assert_close(depth_tensor(np.ma.masked_array(expected[0].numpy())), expected)  # nothing is masked
 
     def test_feature_masked_images_are_divided_whole_or_refused(self):
         image = np.ma.masked_array(picture("uint8", 4, 5, 3))
-        plain, depth = to_tensor(image.data), np.ones((4, 5))
-        assert torch.equal(to_tensor(image), plain)
+        depth = np.ones((4, 5))
+        assert torch.equal(image_tensor(image), image_tensor(image.data))
         image.mask = np.indices(image.shape)[1] == 2
-        assert torch.equal(to_tensor(image), plain)
         for name, call in (
             ("image", lambda: kornia_tidy.simulate(image, depth)),
             ("capture", lambda: kornia_tidy.reconstruct(image)),

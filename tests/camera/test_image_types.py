@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from kornia_tidy.camera.image_types import cropped_image, depth_tensor, image_tensor, like_image
+from kornia_tidy.arrays import cropped_image, depth_tensor, image_tensor, like_image
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
 

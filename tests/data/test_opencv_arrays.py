@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from kornia_tidy.camera.image_types import image_tensor
+from kornia_tidy.arrays import image_tensor
 from kornia_tidy.data import read_image, to_opencv, write_image
 from tests.base import BaseTester
 

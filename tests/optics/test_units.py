@@ -25,9 +25,8 @@ from kornia_tidy import (
     ThinLensCamera,
     TiDyOptics,
 )
-from kornia_tidy.augmentation.arrays import depth_to_tensor
+from kornia_tidy.arrays import depth_tensor
 from kornia_tidy.camera.burst import burst
-from kornia_tidy.camera.image_types import depth_tensor
 from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.cli import main
 from kornia_tidy.data.depth_files import read_depth, write_depth
@@ -125,7 +124,6 @@ class TestDepthScale(BaseTester):
     """Units per metre, as Open3D, TUM RGB-D and ROS give them, where metres per unit are asked for."""
 
     READERS = (
-        lambda stored, scale, folder: depth_to_tensor(stored, scale)[0],
         lambda stored, scale, folder: depth_tensor(stored, scale),
         lambda stored, scale, folder: depth_tensor(torch.from_numpy(stored)[None], scale),
         lambda stored, scale, folder: read_depth(saved(stored, folder), scale).depth,

@@ -1,4 +1,4 @@
-"""Types of images: NumPy arrays, PIL images and whole numbers to tensors in [0, 1], and back."""
+"""The conversion between tensors and arrays, PIL images or whole numbers: images in [0, 1], depth in metres."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import DTypeLike
 from torch import Tensor
 
-from kornia_tidy.checks import described, unmasked
-from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.optics.units import check_depth_scale, metres_per_unit
+from kornia_tidy.checks import check_finite, check_float_tensor, check_positive, described, unmasked
+
+FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of several metres each
+FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millimetres reaches
+_ROWS = 256  # rounded at a time, so that the copy in float64 stays small
 
 
 def image_tensor(image: Any) -> Tensor:
@@ -35,7 +38,7 @@ def image_tensor(image: Any) -> Tensor:
     if type(image) is not Tensor and isinstance(image, Tensor):
         image = image.as_subclass(Tensor)  # MONAI's MetaTensor lacks operators that a capture needs
     if not isinstance(image, Tensor):
-        image = torch.from_numpy(_planes(unmasked("image", _array("image", image))))
+        image = torch.from_numpy(_planes(unmasked("image", as_array("image", image))))
     if image.is_floating_point():
         return image
     if image.dtype not in (torch.uint8, torch.uint16):
@@ -56,7 +59,7 @@ def like_image(image: Tensor, like: Any) -> Any:
     """
     if isinstance(like, Tensor):
         return image if like.is_floating_point() else _whole(image, like.dtype)
-    array = _array("image", like)
+    array = as_array("image", like)
     values = image.detach().cpu()
     if array.dtype.kind in "ui":
         values = _whole(values, torch.uint8 if array.dtype == np.uint8 else torch.uint16)
@@ -88,7 +91,7 @@ def depth_tensor(depth: Any, scale: float | None = None) -> Tensor:
     if type(depth) is not Tensor and isinstance(depth, Tensor):
         depth = depth.as_subclass(Tensor)
     if not isinstance(depth, Tensor):
-        depth = torch.from_numpy(_planes(np.ma.filled(_array("depth", depth), 0)))
+        depth = torch.from_numpy(_planes(np.ma.filled(as_array("depth", depth), 0)))
         if depth.shape[-3] != 1:
             raise ValueError(f"depth must have one channel, got {depth.shape[-3]}")
     if depth.is_complex() or depth.dtype == torch.bool:
@@ -98,22 +101,6 @@ def depth_tensor(depth: Any, scale: float | None = None) -> Tensor:
     if scale > 1:
         check_depth_scale(scale, wide.detach().double().cpu().numpy())
     return wide if scale == 1 else wide.to(torch.promote_types(wide.dtype, torch.float32)) * scale
-
-
-def filled_depth(depth: Any) -> tuple[Any, Any]:
-    """Fill the holes of a depth map that :func:`depth_tensor` takes. See :func:`kornia_tidy.data.fill_holes`.
-
-    Returns:
-        The depth in its kind, and where it was known: a tensor of bool for a tensor, else an array.
-
-    Example:
-        >>> filled_depth(np.array([[500, 0, 2000]], np.uint16))
-        (array([[ 500,  500, 2000]], dtype=uint16), array([[ True, False,  True]]))
-    """
-    if isinstance(depth, Tensor):
-        return fill_holes(depth if type(depth) is Tensor else depth.as_subclass(Tensor))
-    filled, valid = fill_holes(_array("depth", depth))
-    return filled if isinstance(depth, np.ndarray) else sys.modules["PIL.Image"].fromarray(filled), valid
 
 
 def cropped_image(image: Any, margin: int) -> Any:
@@ -137,7 +124,88 @@ def cropped_image(image: Any, margin: int) -> Any:
     return image.crop((margin, margin, image.width - margin, image.height - margin))
 
 
-def _array(name: str, value: Any) -> np.ndarray:
+def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> np.ndarray:
+    """Convert a tensor to an OpenCV picture.
+
+    Args:
+        image: (3, H, W) in RGB or (1, H, W); values outside [0, 1] are clipped.
+        dtype: uint8 or uint16.
+
+    Returns:
+        (H, W, 3) in BGR, or (H, W); rounded to the nearest.
+
+    Raises:
+        TypeError: if the image is not a floating-point tensor, or the data type is another.
+        ValueError: if its shape or a value (NaN, infinity) is not as above.
+
+    Example:
+        >>> to_opencv(torch.tensor([[[0.0, 0.5, 2.0]]]), np.uint16)
+        array([[    0, 32768, 65535]], dtype=uint16)
+    """
+    if np.dtype(dtype) not in (np.uint8, np.uint16):
+        raise TypeError(f"a picture of OpenCV's must be of uint8 or uint16, got {np.dtype(dtype)}")
+    check_float_tensor("image", image, 3, "(C, H, W)")
+    if image.shape[0] not in {1, 3} or 0 in image.shape:
+        raise ValueError(f"image must have shape (3, H, W) or (1, H, W), got {tuple(image.shape)}")
+    check_finite("image", image)
+    return like_image(image.flip(0), np.empty((0,) * (2 if image.shape[0] == 1 else 3), dtype))
+
+
+def metres_per_unit(scale: float | None, whole: bool, kind: Any) -> float:
+    """Return the metres in one stored unit of a depth map: the scale, or 1 for floating-point numbers without one.
+
+    Args:
+        scale: metres per unit, or None.
+        whole: whether whole numbers are stored.
+        kind: their data type, for the message.
+
+    Raises:
+        ValueError: if whole numbers come without a scale, or it is not positive.
+
+    Example:
+        >>> metres_per_unit(None, False, "float32"), metres_per_unit(0.001, True, "uint16")
+        (1.0, 0.001)
+    """
+    if scale is None and whole:
+        raise ValueError(f"a depth of {kind} needs depth_scale, metres per unit, such as 0.001 for millimetres")
+    check_positive("depth_scale", 1.0 if scale is None else scale, "metres per unit")
+    return 1.0 if scale is None else float(scale)
+
+
+def check_depth_scale(scale: float, stored: np.ndarray) -> None:
+    """Raise if a scale is probably units for each metre, as in Open3D, TUM RGB-D and ROS, instead of metres per unit.
+
+    Two conditions must hold. A unit is more than a metre. The near pixels, at the lowest hundredth, are at 500 m
+    or farther, or at 100 km where values have fractions, as depth in kilometres does.
+
+    Args:
+        scale: metres for each stored unit.
+        stored: known values of a depth map, any shape; only positive and finite ones count.
+
+    Raises:
+        ValueError: if both hold.
+
+    Example:
+        >>> check_depth_scale(1000, np.array([700, 1500]))
+        Traceback (most recent call last):
+        ValueError: depth_scale is metres for each stored unit, and 1000 puts near pixels at 7e+05 m: for 1000 \
+units in a metre give 0.001, not 1000; for metres 1 (--depth-scale)
+        >>> check_depth_scale(1000, np.array([0.5, 2.25]))  # kilometres
+    """
+    if scale <= 1:
+        return
+    known = stored[(stored > 0) & np.isfinite(stored)]
+    if not known.size:
+        return
+    near = scale * float(np.quantile(known, 0.01, method="nearest"))
+    if near >= (FAR_WHOLE if bool((known == np.rint(known)).all()) else FARTHEST):
+        raise ValueError(
+            f"depth_scale is metres for each stored unit, and {scale:g} puts near pixels at {near:.3g} m: for "
+            f"{scale:g} units in a metre give {1 / scale:.6g}, not {scale:g}; for metres 1 (--depth-scale)"
+        )
+
+
+def as_array(name: str, value: Any) -> np.ndarray:
     """Return an array or a PIL image as an array."""
     if isinstance(value, np.ndarray):
         return value
@@ -161,5 +229,9 @@ def _planes(array: np.ndarray) -> np.ndarray:
 
 
 def _whole(image: Tensor, dtype: torch.dtype) -> Tensor:
-    top = torch.iinfo(dtype).max
-    return (image.to(torch.promote_types(image.dtype, torch.float32)).clamp(0, 1) * top).round().to(dtype)
+    """Return an image in whole numbers, rounded in float64 where the device has it."""
+    wide, top = torch.float64 if image.device.type == "cpu" else torch.float32, torch.iinfo(dtype).max
+    whole = torch.empty_like(image, dtype=dtype)
+    for band, rows in zip(image.split(_ROWS, -2), whole.split(_ROWS, -2), strict=True):
+        rows.copy_((band.to(wide).clamp(0, 1) * top).round())
+    return whole
