@@ -87,14 +87,6 @@ class FlyingThings3D(SceneDataset):
             raise FileNotFoundError(f"{self.folder} has no {view} frames *{self.suffix} of {split.upper()} {subsets}")
         self._check_disparities(split, view, subsets)
 
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.names)
-
-    def name(self, index: int) -> str:
-        """Return the published path of a frame, without its suffix."""
-        return self.names[index]
-
     def read(self, index: int) -> Scene:
         """Read a frame and its disparity."""
         name = self.names[index]

@@ -67,17 +67,10 @@ class NYUDepthV2(SceneDataset):
         self.crop_border = crop_border
         count = self._count()
         self.numbers = range(1, count + 1) if split == "all" else _read_split(Path(root), split)
+        self.names = [f"{number:04d}" for number in self.numbers]
         outside = [number for number in self.numbers if not 1 <= number <= count]
         if outside:
             raise ValueError(f"split {split} names frame {outside[0]}, and {self.path} has frames 1 to {count}")
-
-    def __len__(self) -> int:
-        """Return the number of frames in the split."""
-        return len(self.numbers)
-
-    def name(self, index: int) -> str:
-        """Return the published number of a frame."""
-        return f"{self.numbers[index]:04d}"
 
     def read(self, index: int) -> Scene:
         """Read a frame."""

@@ -80,16 +80,9 @@ class RGBDFolder(SceneDataset):
             check_depth_options(**stored)
         self.root = Path(root)
         self.pairs = _pair(self.root, image, depth)
+        self.names = [name for name, _, _ in self.pairs]
         self.options: dict[str, Any] = options
         self.calibrations = None if calibration is None else self._calibrations(calibration)
-
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.pairs)
-
-    def name(self, index: int) -> str:
-        """Return the name of a pair: the parts that ``*`` matches."""
-        return self.pairs[index][0]
 
     def read(self, index: int) -> Scene:
         """Read image and depth of a pair."""

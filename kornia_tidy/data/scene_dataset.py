@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, SupportsIndex
 
 from torch.utils.data import Dataset
@@ -24,8 +24,7 @@ class UnreadableItemError(ValueError):
 class SceneDataset(Dataset[Any]):
     """Base class of the data sets of scenes.
 
-    A subclass defines the number of scenes (``__len__``), the name of a scene (:meth:`name`) and how it is read
-    (:meth:`read`). Items depend only on their index: they are the same in every epoch and for any number of workers,
+    A subclass sets ``names``, the name of each scene, and defines how one is read (:meth:`read`). Items depend only on their index: they are the same in every epoch and for any number of workers,
     forked or spawned. No file stays open between items.
 
     Args:
@@ -48,13 +47,16 @@ class SceneDataset(Dataset[Any]):
     def __init__(self, transform: Transform | None = None) -> None:
         self.transform = transform
 
-    @abstractmethod
+    names: Sequence[str] = ()
+    """Of the scenes, known without reading them."""
+
     def __len__(self) -> int:
         """Return the number of scenes."""
+        return len(self.names)
 
-    @abstractmethod
     def name(self, index: int) -> str:
-        """Return the name of a scene without reading it."""
+        """Return the name of a scene."""
+        return self.names[index]
 
     @abstractmethod
     def read(self, index: int) -> Scene:

@@ -47,14 +47,7 @@ class SUNRGBD(SceneDataset):
         if not frames:
             raise FileNotFoundError(f"SUN RGB-D is not in {self.root}: a frame is a folder with image/ and {part}/")
         self.pairs = [(_only_file(frame / "image"), _only_file(frame / part)) for frame in frames]
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self.pairs)
-
-    def name(self, index: int) -> str:
-        """Return the path of a frame's folder."""
-        return self.pairs[index][0].parent.parent.relative_to(self.root).as_posix()
+        self.names = [frame.relative_to(self.root).as_posix() for frame in frames]
 
     def read(self, index: int) -> Scene:
         """Read a frame."""

@@ -45,14 +45,7 @@ class TUMSequence(SceneDataset):
         self.root = Path(root)
         lists = [self.root / name for name in ASSOCIATIONS if (self.root / name).is_file()]
         self.pairs = _listed(lists[0]) if lists else _associated(self.root, max_difference)
-
-    def __len__(self) -> int:
-        """Return the number of pairs."""
-        return len(self.pairs)
-
-    def name(self, index: int) -> str:
-        """Return the listed time of an image."""
-        return self.pairs[index][0]
+        self.names = [time for time, _, _ in self.pairs]
 
     def read(self, index: int) -> Scene:
         """Read a pair."""
