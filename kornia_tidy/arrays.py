@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import DTypeLike
 from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_float_tensor, check_positive, described, unmasked
+
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
 
 FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of several metres each
 FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millimetres reaches

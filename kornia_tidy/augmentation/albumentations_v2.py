@@ -14,10 +14,9 @@ import numpy as np
 import torch
 
 from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
-from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
+from kornia_tidy.augmentation.depth_augmentation import checked_optics
 from kornia_tidy.camera.holes import both_valid, fills_holes
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part, unmasked
+from kornia_tidy.checks import check_choice, unmasked
 from kornia_tidy.optics.holes import HOLES, fill_holes
 
 try:
@@ -84,12 +83,7 @@ class OpticsTransform(A.DualTransform):
         check_choice("holes", holes, HOLES)
         super().__init__(p=p)
         self.depth_scale, self.holes = depth_scale, holes
-        self.optics = TiDyOptics() if optics is None else optics
-        expected = "TiDyOptics or an augmentation that reads depth"
-        check_part("optics", self.optics, (TiDyOptics, DepthAugmentation), expected)
-        camera = self.optics if isinstance(self.optics, TiDyOptics) else getattr(self.optics, "optics", None)
-        if getattr(camera, "border", None) == "valid":
-            raise ValueError("border 'valid' crops the image and not the other targets: use another border")
+        self.optics = checked_optics(optics)
         self.mask_interpolation = cv2.INTER_NEAREST  # Compose(mask_interpolation=) sets it, as that of every transform
 
     def __call__(self, *args: Any, force_apply: bool = False, **kwargs: Any) -> Any:

@@ -15,7 +15,8 @@ from kornia_tidy.augmentation.pipeline_transform import AugmentationTransform
 from kornia_tidy.augmentation.ranges import check_probability
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs
 from kornia_tidy.camera.holes import fills_holes
-from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_choice, check_float_tensor, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
 
 _PIXELWISE = ("kornia.color", "kornia.enhance", "kornia.filters")  # packages whose modules move no pixel
@@ -233,6 +234,30 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
     def __getstate__(self) -> dict[str, Any]:
         """Return what travels with pickle and deepcopy: no depth."""
         return {**super().__getstate__(), "bound": None}
+
+
+def checked_optics(optics: nn.Module | None) -> nn.Module:
+    """Return what takes the pictures of an adapter: the camera or augmentation that was given, or a default camera.
+
+    Raises:
+        TypeError: if it is neither.
+        ValueError: if its border crops the image, which the other entries of a sample would not follow.
+
+    Example:
+        >>> checked_optics(None).border
+        'reflect'
+    """
+    optics = TiDyOptics() if optics is None else optics
+    check_part("optics", optics, (TiDyOptics, DepthAugmentation), "TiDyOptics or an augmentation that reads depth")
+    if getattr(camera_of(optics), "border", None) == "valid":
+        raise ValueError("border 'valid' crops the image and not the other entries of a sample: use another border")
+    return optics
+
+
+def camera_of(optics: nn.Module) -> TiDyOptics | None:
+    """Return a camera, or that of an augmentation; None if it has none."""
+    camera = optics if isinstance(optics, TiDyOptics) else getattr(optics, "optics", None)
+    return camera if isinstance(camera, TiDyOptics) else None
 
 
 @contextmanager

@@ -9,12 +9,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from kornia.augmentation.random_generator import PlainUniformGenerator
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.lens_argument import lens_parts
-from kornia_tidy.augmentation.ranges import Range, checked_range
+from kornia_tidy.augmentation.ranges import Range, checked_range, uniform_draws
 from kornia_tidy.augmentation.rows import row_places
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import (
@@ -339,13 +338,9 @@ class RandomDepthBlur(DepthAugmentation):
     ) -> None:
         super().__init__(same_on_batch=same_on_batch, p=p, keepdim=keepdim, holes=holes)
         nearest, farthest = checked_range("focus_distance", focus_distance, "metres")
-        fastest, slowest = checked_range("f_number", f_number)
-        _check_lens(nearest, fastest, focal_length, pixel_pitch, max_radius, compositing, color_space)
-        ends = torch.tensor([fastest, slowest], device="cpu")
-        focus = torch.tensor([nearest, farthest], device="cpu")
-        self._param_generator = PlainUniformGenerator(
-            (focus, "focus_distance", None, None), (ends, "f_number", None, None)
-        )
+        stops = checked_range("f_number", f_number)
+        _check_lens(nearest, stops[0], focal_length, pixel_pitch, max_radius, compositing, color_space)
+        self._param_generator = uniform_draws({"focus_distance": (nearest, farthest), "f_number": stops})
         self.flags = {
             "focal_length": focal_length,
             "pixel_pitch": pixel_pitch,
@@ -353,7 +348,7 @@ class RandomDepthBlur(DepthAugmentation):
             "compositing": compositing,
             "color_space": color_space,
         }
-        own = (nearest, farthest), tuple(ends.tolist()), focal_length, max_radius
+        own = (nearest, farthest), stops, focal_length, max_radius
         self.optics = None if lens is None else _lens_camera(lens, pixel_pitch, compositing, color_space, own)
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:

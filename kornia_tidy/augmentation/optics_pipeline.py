@@ -7,17 +7,21 @@ from functools import reduce
 from typing import Any, cast
 
 import kornia.augmentation as K
-import torch
 from torch import Tensor, nn
 
-from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, container_leaves, moves_pixels
-from kornia_tidy.augmentation.pipeline_transform import PipelineTransform
+from kornia_tidy.augmentation.depth_augmentation import (
+    DepthAugmentation,
+    camera_of,
+    checked_optics,
+    container_leaves,
+    moves_pixels,
+)
+from kornia_tidy.augmentation.pipeline_transform import PipelineTransform, draws_at
 from kornia_tidy.augmentation.scene_geometry import SceneGeometry, warped_entries
 from kornia_tidy.camera.holes import DEPTH_KEYS, both_valid, fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part
+from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.holes import HOLES, fill_holes
-from kornia_tidy.psf.field import check_centers
 
 
 class OpticsPipeline(nn.Module):
@@ -75,11 +79,6 @@ class OpticsPipeline(nn.Module):
         check_choice("holes", holes, HOLES)
         super().__init__()
         self.holes = holes
-        optics = TiDyOptics() if optics is None else optics
-        check_part("optics", optics, (TiDyOptics, DepthAugmentation), "TiDyOptics or an augmentation that reads depth")
-        camera = optics if isinstance(optics, TiDyOptics) else getattr(optics, "optics", None)
-        if getattr(camera, "border", None) == "valid":
-            raise ValueError("border 'valid' crops image and depth alone, got it in a pipeline: use another border")
         for leaf in container_leaves(photometry) if photometry is not None else ():
             if moves_pixels(leaf) or isinstance(leaf, DepthAugmentation):
                 raise ValueError(
@@ -88,7 +87,7 @@ class OpticsPipeline(nn.Module):
                 )
         whole = geometry is None or isinstance(geometry, SceneGeometry)
         self.geometry = geometry if whole else SceneGeometry(cast("nn.Module", geometry))
-        self.optics = optics
+        self.optics = checked_optics(optics)
         self.photometry = None if photometry is None else K.ImageSequential(photometry)
         self.params: dict[str, Any] = {}
 
@@ -180,22 +179,15 @@ class OpticsPipeline(nn.Module):
 
     def _place(self, before: Tensor, after: Tensor, place: Any) -> Any:
         """Return where the warped pictures lie in the field of the camera's lens; None where nothing says it."""
-        camera = self._camera
+        camera = camera_of(self.optics)
         if camera is None or camera.lens is None or self.geometry is None:
             return place
         return self.geometry.field_center(before, after, camera.field_center if place is None else place)
 
     def _draws(self, image: Tensor, params: dict[str, Any] | None, place: Any) -> dict[str, Any] | None:
         """Return the draws of an augmentation, with the place of each image where that is known."""
-        optics, camera = self.optics, self._camera
+        optics, camera = self.optics, camera_of(self.optics)
         if place is None or params is not None or camera is None or camera.lens is None:
             return params
         assert isinstance(optics, DepthAugmentation)
-        shape = image.shape if image.ndim == 4 else (1, *image.shape)
-        centers = torch.tensor(check_centers(place, shape[0]), dtype=torch.float64).expand(shape[0], 2)
-        return optics.forward_parameters(shape) | {"field_center": centers}
-
-    @property
-    def _camera(self) -> TiDyOptics | None:
-        camera = self.optics if isinstance(self.optics, TiDyOptics) else getattr(self.optics, "optics", None)
-        return camera if isinstance(camera, TiDyOptics) else None
+        return draws_at(optics, image, place)

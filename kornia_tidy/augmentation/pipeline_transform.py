@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -70,11 +70,19 @@ class AugmentationTransform(DatasetTransform):
         with torch.random.fork_rng(enabled=generator is not None):
             if generator is not None:
                 torch.manual_seed(generator.initial_seed())
-            params = None
-            if field_center is not None:  # of a lens, in the draws of the augmentation
-                shape = image.shape if image.ndim == 4 else (1, *image.shape)
-                centers = torch.tensor(check_centers(field_center, shape[0]), dtype=torch.float64)
-                augmentation = cast("Any", self.optics)
-                params = augmentation.forward_parameters(shape) | {"field_center": centers.expand(shape[0], 2)}
+            params = None if field_center is None else draws_at(self.optics, image, field_center)
             coded = self.optics(image, depth, params=params)
         return coded[0] if coded.ndim > image.ndim else coded
+
+
+def draws_at(augmentation: Any, image: Tensor, place: Any) -> dict[str, Any]:
+    """Return random draws of an augmentation behind a lens for pictures at a given place in its field.
+
+    Args:
+        augmentation: that of the camera.
+        image: (B, C, H, W) or (C, H, W).
+        place: y and x of each picture's middle in sensor pixels from the axis, (2,) or (B, 2).
+    """
+    shape = image.shape if image.ndim == 4 else (1, *image.shape)
+    centers = torch.tensor(check_centers(place, shape[0]), dtype=torch.float64)
+    return augmentation.forward_parameters(shape) | {"field_center": centers.expand(shape[0], 2)}

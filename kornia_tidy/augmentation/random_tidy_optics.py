@@ -8,13 +8,12 @@ from itertools import product
 from typing import Any
 
 import torch
-from kornia.augmentation.random_generator import PlainUniformGenerator
 from torch import Tensor
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
 from kornia_tidy.augmentation.drawn_camera import DrawnOptics, RowSensors, drawn_camera, sensor_with
 from kornia_tidy.augmentation.lens_argument import lens_optics, lens_parts
-from kornia_tidy.augmentation.ranges import Range, checked_range
+from kornia_tidy.augmentation.ranges import Range, checked_range, uniform_draws
 from kornia_tidy.augmentation.rows import row_places, row_seeds
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.optics.lens.lens import Lens
@@ -108,8 +107,7 @@ class RandomTiDyOptics(DepthAugmentation):
         }
         ranges = {name: checked_range(name, *given) for name, given in units.items() if given[0] is not None}
         self._check_ends(ranges)
-        samplers = [(torch.tensor(ends, device="cpu"), name, None, None) for name, ends in ranges.items()]
-        self._param_generator = PlainUniformGenerator(*samplers)
+        self._param_generator = uniform_draws(ranges)
 
     def _check_ends(self, ranges: Mapping[str, tuple[float, float]]) -> None:
         """Raise the camera's own error if it cannot be as the ends of the ranges say."""

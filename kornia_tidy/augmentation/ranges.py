@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+
+import torch
+from kornia.augmentation.random_generator import PlainUniformGenerator
 
 from kornia_tidy.checks import check_number
 
@@ -37,6 +40,12 @@ def checked_range(name: str, ends: object, unit: str = "", zero: bool = False) -
             f"{', ' + unit if unit else ''}, got {(low, high)}"
         )
     return low, high
+
+
+def uniform_draws(ranges: Mapping[str, tuple[float, float]]) -> PlainUniformGenerator:
+    """Return kornia's generator of numbers that are drawn from ranges, each uniformly, by their names."""
+    samplers = [(torch.tensor(ends, device="cpu"), name, None, None) for name, ends in ranges.items()]
+    return PlainUniformGenerator(*samplers)
 
 
 def check_probability(p: float) -> None:

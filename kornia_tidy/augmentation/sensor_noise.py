@@ -7,10 +7,9 @@ from typing import Any
 
 import kornia.augmentation as K
 import torch
-from kornia.augmentation.random_generator import PlainUniformGenerator
 from torch import Tensor
 
-from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range
+from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range, uniform_draws
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
@@ -153,9 +152,7 @@ class RandomSensorNoise(K.IntensityAugmentationBase2D):
             raise ValueError(f"dark must stay below full_well, got up to {darks[1]:g} of {wells[0]:g} electrons")
         SensorNoise(bits=bits)  # checks the bits
         reads = checked_range("read_noise", read_noise, "electrons", zero=True)
-        given = {"full_well": wells, "read_noise": reads, "dark": darks}
-        samplers = [(torch.tensor(ends, device="cpu"), name, None, None) for name, ends in given.items()]
-        self._param_generator = PlainUniformGenerator(*samplers)
+        self._param_generator = uniform_draws({"full_well": wells, "read_noise": reads, "dark": darks})
         self.flags = {"bits": bits, "color_space": color_space}
 
     def generate_parameters(self, batch_shape: tuple[int, ...]) -> dict[str, Tensor]:

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.arrays import depth_tensor, image_tensor, like_image
-from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation
+from kornia_tidy.augmentation.depth_augmentation import checked_optics
 from kornia_tidy.camera.holes import fills_holes, with_filled
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_part
+from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.holes import HOLES, fill_holes
 
 try:
@@ -104,12 +103,7 @@ class OpticsTransform(v2.Transform):
         check_choice("holes", holes, HOLES)
         super().__init__()
         self.depth_scale, self.holes = depth_scale, holes
-        self.optics = TiDyOptics() if optics is None else optics
-        expected = "TiDyOptics or an augmentation that reads depth"
-        check_part("optics", self.optics, (TiDyOptics, DepthAugmentation), expected)
-        camera = self.optics if isinstance(self.optics, TiDyOptics) else getattr(self.optics, "optics", None)
-        if getattr(camera, "border", None) == "valid":
-            raise ValueError("border 'valid' crops the image and not the other entries of a sample: use another border")
+        self.optics = checked_optics(optics)
 
     def forward(self, *inputs: Any) -> Any:
         """Return the sample with its images coded, and with its depth filled first if holes are to be filled."""

@@ -24,8 +24,9 @@ class UnreadableItemError(ValueError):
 class SceneDataset(Dataset[Any]):
     """Base class of the data sets of scenes.
 
-    A subclass sets ``names``, the name of each scene, and defines how one is read (:meth:`read`). Items depend only on their index: they are the same in every epoch and for any number of workers,
-    forked or spawned. No file stays open between items.
+    A subclass sets ``names``, the name of each scene, and defines how one is read (:meth:`read`). Items depend only on
+    their index: they are the same in every epoch and for any number of workers, forked or spawned. No file stays open
+    between items.
 
     Args:
         transform: called with each sample, for example ``optics.as_transform(seed=0)``. Default: samples are

@@ -130,7 +130,7 @@ class TestOpticsPipeline(BaseTester):
             OpticsPipeline(photometry=RandomTiDyOptics(camera()))
         with pytest.raises(TypeError, match="optics must be TiDyOptics or an augmentation that reads depth"):
             OpticsPipeline(optics=K.RandomGaussianBlur((3, 3), (1.0, 2.0)))
-        with pytest.raises(ValueError, match="border 'valid' crops image and depth alone"):
+        with pytest.raises(ValueError, match="border 'valid' crops the image and not the other"):
             OpticsPipeline(optics=camera(border="valid"))
         with pytest.raises(TypeError, match="augmentations of kornia that warp a mask"):
             OpticsPipeline(torch.nn.AvgPool2d(2))
