@@ -92,8 +92,8 @@ def simulate(
     """
     optics = lens_optics(optics, lens, _default_optics)
     check_choice("holes", holes, HOLES)
-    pixels = _pixels(unmasked("image", image), color, light=optics.color_space == "linear")
-    metres = _metres(depth, depth_scale)
+    pixels = to_tensor(unmasked("image", image), color, light=optics.color_space == "linear")
+    metres = depth_to_tensor(depth, depth_scale)
     if metres.shape[0] != pixels.shape[0] or metres.shape[-2:] != pixels.shape[-2:]:
         raise ValueError(f"depth must have the rows, columns and batch of the image {image.shape}, got {depth.shape}")
     if fills_holes(optics, holes):
@@ -142,7 +142,7 @@ def reconstruct(
         >>> image.shape, depth
         ((32, 48, 3), None)
     """
-    pixels = _pixels(unmasked("capture", capture), color)
+    pixels = to_tensor(unmasked("capture", capture), color)
     check_positive("memory_budget", memory_budget, "bytes")
     if not len(pixels):
         raise ValueError(f"captures must be one or more, got shape {capture.shape}")
@@ -161,8 +161,22 @@ def reconstruct(
     )
 
 
-def _pixels(image: NDArray[Any], color: Color, light: bool = False) -> Tensor:
-    """Return images as a tensor (B, C, H, W) in RGB; floats above 1 are allowed in linear light."""
+def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) -> Tensor:
+    """Return arrays of images as a tensor (B, C, H, W) in RGB, float32; integers are scaled to [0, 1].
+
+    Args:
+        image: as for :func:`simulate`.
+        color: order of three channels.
+        light: whether floats above 1 are allowed, as linear light may be.
+
+    Raises:
+        TypeError: if it is not an array, or has another data type.
+        ValueError: if the shape or a value is not allowed.
+
+    Example:
+        >>> to_tensor(np.array([[[0, 51, 255]]], np.uint8)).flatten().tolist()
+        [1.0, 0.20000000298023224, 0.0]
+    """
     check_choice("color", color, ("bgr", "rgb"))
     if not isinstance(image, np.ndarray) or image.dtype not in IMAGES:
         kind = image.dtype if isinstance(image, np.ndarray) else described(image)
@@ -181,8 +195,21 @@ def _pixels(image: NDArray[Any], color: Color, light: bool = False) -> Tensor:
     return pixels if pixels.ndim == 4 else pixels[None]
 
 
-def _metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
-    """Return depth maps in metres, (B, 1, H, W) float32; 0 where a masked array is masked."""
+def depth_to_tensor(depth: NDArray[Any], depth_scale: float | None = None) -> Tensor:
+    """Return arrays of depths in metres as a tensor (B, 1, H, W), float32; 0 where a masked array is masked.
+
+    Args:
+        depth: as for :func:`simulate`.
+        depth_scale: metres per unit. None: floats are metres.
+
+    Raises:
+        TypeError: if it is not an array of integers or floats.
+        ValueError: if the shape is not allowed, integers come without a scale, or it is units per metre.
+
+    Example:
+        >>> depth_to_tensor(np.array([[0, 500, 2000]], np.uint16), 0.001)
+        tensor([[[[0.0000, 0.5000, 2.0000]]]])
+    """
     if not isinstance(depth, np.ndarray) or depth.dtype.kind not in "uif":
         kind = depth.dtype if isinstance(depth, np.ndarray) else described(depth)
         raise TypeError(f"depth must be an array of integers or floats, got {kind}")
