@@ -10,7 +10,7 @@ import torch
 from kornia_tidy.data.photo_collages import photographs_in
 from kornia_tidy.reconstruction.any_camera import WEIGHTS
 from tests.benchmarks.any_camera.cameras import POOLS
-from tests.benchmarks.any_camera.captures import photograph, photograph_collages
+from tests.benchmarks.any_camera.captures import photograph, photograph_collages, photograph_pictures
 from tests.benchmarks.any_camera.closed_form import sweep
 from tests.benchmarks.any_camera.guards import measure
 from tests.benchmarks.any_camera.scores import averaged, first_weights, mixed, score_pool
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("step", choices=("photograph", "sweep", "train", "closed-forms", "score", "guards", "ship"))
     parser.add_argument("folder", type=Path, help="of captures, checkpoints and scores; a step goes on where it ended")
     parser.add_argument("--pool", choices=tuple(POOLS), default="training")
-    parser.add_argument("--photographs", type=Path, help="folder, for collages")
+    parser.add_argument("--photographs", type=Path, help="folder, for collages and whole ones")
     parser.add_argument("--share", type=float, default=0.0, help="of the first weights in those that are shipped")
     parser.add_argument("--steps", type=int, default=2400)
     options = parser.parse_args()
@@ -32,7 +32,9 @@ def main() -> None:
         if options.photographs is None:
             photograph(options.folder / "captures", options.pool)
         else:
-            photograph_collages(options.folder / "captures", photographs_in(options.photographs))
+            photographs = photographs_in(options.photographs)
+            photograph_collages(options.folder / "captures", photographs)
+            photograph_pictures(options.folder / "captures", photographs)
     elif options.step == "sweep":
         sweep(options.folder, options.pool)
     elif options.step == "train":

@@ -98,7 +98,7 @@ def photograph_collages(folder: Path, photographs: Sequence[str], scenes: int = 
         _write({image: shown, light: seen})
 
 
-def photograph_pictures(folder: Path, photographs: Sequence[Path], scenes: int = 10) -> None:
+def photograph_pictures(folder: Path, photographs: Sequence[Path], scenes: int = 40) -> None:
     """Make captures of whole photographs by the cameras of training, those of shipped systems first; of these more."""
     names = pool_names("training")
     for name in [*SHIPPED, *(one for first in range(STRIDE) for one in names[len(SHIPPED) + first :: STRIDE])]:
