@@ -27,11 +27,10 @@ from kornia_tidy.optics.lens.made_lenses import named_focal_length
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
+from kornia_tidy.reconstruction.camera_system import any_camera_system
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.metrics import psnr, rmse
 from kornia_tidy.reconstruction.pretrained import load_pretrained
-from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth, split_maps, stretched
 from kornia_tidy.reconstruction.trained import TrainedSystem, update_psfs
 from kornia_tidy.sensor.sensor import SensorNoise
@@ -83,8 +82,8 @@ def take_picture(settings: Settings, tell: Tell = lambda share, stage: None) -> 
         tell: called before each stage with the share of the work that is done, and the stage in words.
 
     Returns:
-        The capture and its reconstruction. Trained systems are reconstructed by their network, all others by
-        deconvolution in closed form, which gives no depth.
+        The capture and its reconstruction. Trained systems are reconstructed by their network, all others by the
+        network for any camera, which gives no depth.
 
     Raises:
         ValueError: if the camera cannot be made, its blur is wider than the PSFs of a capture, or files do not fit.
@@ -259,17 +258,10 @@ def known_system(name: str, compositing: str, noise: float, mask_seed: int) -> t
 def reconstruct(capture: Tensor, optics: TiDyOptics, system: TrainedSystem | None) -> tuple[Tensor, Tensor | None]:
     """Return the all-in-focus image, and the normalised inverse depth if the system is trained for it."""
     if system is None:
-        head = ClosedFormHead()
-        update_psfs(head, optics)
-        if optics.lens is None:
-            return head(capture[None])[0], None
-
-        def restore(part: Tensor, psfs: PSFBank) -> Tensor:
-            head.closed_form.set_psfs(psfs)
-            return head(part)
-
-        center = optics.field_center
-        return restored_over_field(capture[None], optics.psf_model, restore, center=center)[0], None
+        head = LightHead(any_camera_system(optics))
+        image = reconstruct_light(head, optics.decode(capture[None])[0]).image
+        assert image is not None  # of a head for images
+        return image, None
     maps = split_maps(system.settings.task, system.head(capture[None]))
     depth = maps.get("depth")
     return maps["image"][0].clamp(0, 1), None if depth is None else depth[0].clamp(0, 1)

@@ -23,17 +23,13 @@ def legends(result: Result) -> dict[str, str]:
     count = len(result.optics.masks.phase)
     plain = (settings.camera == OWN and settings.start == FLAT) or settings.camera.endswith(("-0", "-flat"))
     through = "a lens without programmed masks" if plain else f"{count} masks, in turn" if count > 1 else "1 mask"
-    by = (
-        f"by the network of {settings.camera}"
-        if settings.camera in PRETRAINED
-        else "by deconvolution in closed form with the mean PSF of all depths, no training"
-    )
+    by = f"of {settings.camera}" if settings.camera in PRETRAINED else "for any camera, not trained for this one"
     window = result.optics.window
     return {
         "scene": f"**Scene**, all in focus, {width} x {height} pixels.",
         "capture": f"**Capture**: one exposure through {through}; {result.optics.compositing}, noise "
         f"{100 * settings.noise:.3g} % of full scale. PSNR {scores['capture_psnr']:.1f} dB against the scene.",
-        "image": f"**Reconstruction** {by}. PSNR {scores['image_psnr']:.1f} dB.",
+        "image": f"**Reconstruction** by the network {by}. PSNR {scores['image_psnr']:.1f} dB.",
         "depth": "**Depth of the scene**, metres; bright is near.",
         "estimate": _estimated(scores),
         "psfs": f"**Masks and PSFs over depth.** Left: phase of each mask at 530 nm, 0 to 2π, dark at 0 and 2π. Right: "

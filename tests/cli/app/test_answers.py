@@ -103,7 +103,7 @@ class TestLegends(BaseTester):
     def test_feature_a_plain_lens_shows_no_masks_in_turn(self, own):
         words = legends(own)
         assert "a lens without programmed masks" in words["capture"]
-        assert "closed form" in words["image"]
+        assert "by the network for any camera" in words["image"]
         assert "adds up" not in words["psfs"]
 
     @pytest.mark.parametrize(
