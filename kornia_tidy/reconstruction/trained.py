@@ -52,7 +52,7 @@ class TrainedSystem(NamedTuple):
     """Record of the training, such as scores, of :func:`kornia_tidy.reconstruction.hub.save_pretrained`."""
 
 
-def build_optics(settings: SystemSettings, psfs: PSFBank | None = None) -> TiDyOptics:
+def build_optics(settings: SystemSettings, psfs: PSFBank | FieldBank | None = None) -> TiDyOptics:
     """Return the camera that settings describe, with the initial masks and a fixed PSF window.
 
     Args:
@@ -237,8 +237,8 @@ def psfs_to_store(optics: TiDyOptics) -> dict[str, Tensor]:
     return {name: value for name, value in fields.items() if value is not None}
 
 
-def stored_psfs(state: Mapping[str, Any]) -> PSFBank | None:
-    """Return the measured PSFs of a state that was read; None if it has none.
+def stored_psfs(state: Mapping[str, Any]) -> PSFBank | FieldBank | None:
+    """Return the measured PSFs of a state that was read, of one place or over the field; None if it has none.
 
     Raises:
         ValueError: if they are no PSFs, or a value is not finite.
@@ -249,7 +249,7 @@ def stored_psfs(state: Mapping[str, Any]) -> PSFBank | None:
     if not tensors:
         return None
     try:
-        bank = PSFBank(**tensors)
+        bank = (FieldBank if "field" in tensors else PSFBank)(**tensors)
     except TypeError:
         raise ValueError(f"measured PSFs must have psfs, defocus and energy, got {sorted(tensors)!r:.80}") from None
     for name, value in tensors.items():

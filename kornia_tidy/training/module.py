@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
@@ -174,7 +175,7 @@ class TidyTraining(pl.LightningModule):
         cls,
         settings: TrainingSettings,
         *,
-        psfs: PSFBank | None = None,
+        psfs: PSFBank | FieldBank | None = None,
         design: bool = True,
         progress: bool = False,
     ) -> TidyTraining:

@@ -21,6 +21,7 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.saved_camera import below
 from kornia_tidy.files import only_here
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
@@ -59,7 +60,7 @@ def train(
     head_from: str | os.PathLike[str] | None = None,
     refiner_from: str | os.PathLike[str] | None = None,
     masks_from: str | os.PathLike[str] | None = None,
-    psfs: PSFBank | None = None,
+    psfs: PSFBank | FieldBank | None = None,
     captures: str | os.PathLike[str] | None = None,
     save_every: int = 100,
     workers: int = 0,
@@ -126,7 +127,7 @@ def _train(
     head_from: str | os.PathLike[str] | None,
     refiner_from: str | os.PathLike[str] | None,
     masks_from: str | os.PathLike[str] | None,
-    psfs: PSFBank | None,
+    psfs: PSFBank | FieldBank | None,
     captures: Path,
     save_every: int,
     workers: int,
@@ -218,7 +219,9 @@ def _read_run(path: Path) -> dict[str, Any]:
     return state
 
 
-def _same_psfs(given: PSFBank | None, stored: PSFBank | None, path: Path | None) -> PSFBank | None:
+def _same_psfs(
+    given: PSFBank | FieldBank | None, stored: PSFBank | FieldBank | None, path: Path | None
+) -> PSFBank | FieldBank | None:
     """Return the measured PSFs of a run, or raise ``ValueError`` if others are given for going on with it."""
     if given is not None and (stored is None or not torch.equal(given.psfs, stored.psfs)):
         raise ValueError(f"cannot resume from {path}: its PSFs are not those that are given")

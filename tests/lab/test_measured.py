@@ -16,6 +16,7 @@ from kornia_tidy.lab.measured import (
     takes_psfs,
     with_measurements,
 )
+from kornia_tidy.psf import FieldBank
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
@@ -55,6 +56,17 @@ class TestClosedFormSystem(BaseTester):
         assert "measured" in (folder / "README.md").read_text()
         capture = torch.rand(1, 3, 40, 40)
         assert torch.equal(again.head(capture), system.head(capture))
+
+    def test_feature_a_folder_holds_psfs_of_several_places(self, psfs, tmp_path):
+        system = closed_form_system(psfs, SENSOR, "tikhonov")
+        turned = replace(psfs.bank, psfs=psfs.bank.psfs.flip(-1))
+        system.optics = system.optics.with_bank(FieldBank.from_measured([psfs.bank, turned], [(0, 0), (0, 300)]))
+        again = from_pretrained(save_pretrained(system, tmp_path / "mine"))
+        image, depth = torch.rand(1, 3, 40, 40), torch.full((1, 1, 40, 40), 0.6)
+        system.optics.sensor = again.optics.sensor = None
+        for place in ((0.0, 0.0), (0.0, 300.0)):
+            seen = [one.optics(image, depth, field_center=place) for one in (system, again)]
+            assert torch.equal(*seen)
 
     def test_exception_a_checkpoint_whose_psfs_do_not_fit(self, psfs, tmp_path):
         system = closed_form_system(psfs, SENSOR)

@@ -112,7 +112,10 @@ def _rows(path: str | os.PathLike[str]) -> tuple[list[_Row], list[_Row]]:
             header.append(_Row(line, _plain(whole[:LONGEST])))
     if not found:
         raise ValueError(f"cannot read {path}: {_FORM}, as text, and no line has numbers alone")
-    separator, decimal = _punctuation([row.text for row in found], header)
+    try:
+        separator, decimal = _punctuation([row.text for row in found], header)
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from None
     rows = []
     for row in found:
         try:
@@ -150,6 +153,11 @@ def _punctuation(rows: Sequence[str], header: Sequence[_Row]) -> tuple[str, str]
     levels = sorted(float(first or 0) for first, _, _ in pairs) == list(range(len(rows)))
     degrees = all(re.fullmatch(r"0|[1-9]\d{0,2}", second) for _, _, second in pairs)
     columns = levels and (degrees or any(re.search(f"({_LEVEL}).*,", row.text) for row in header))
+    if levels and not columns and all(re.fullmatch(r"0|[1-9]\d*", second) for _, _, second in pairs):
+        raise ValueError(
+            f"lines such as {rows[-1]!r:.80} may be a level and a whole number, or one phase with a decimal comma: "
+            f"separate columns by ';', or write decimals with a point"
+        )
     return (",", ".") if columns else (r"\s+", ",")
 
 

@@ -30,7 +30,7 @@ ALL = dict(flat())
 every_command = pytest.mark.parametrize("words", ALL, ids=" ".join)
 # Words that mean something else for commands of other things.
 OTHER_MEANINGS = {
-    "bits", "black", "depth_weight", "electrons", "masks", "output", "reference", "scenes", "size",
+    "bits", "black", "depth_weight", "electrons", "lens", "masks", "output", "reference", "scenes", "size",
 }  # fmt: skip
 
 

@@ -127,6 +127,7 @@ class TestReadResponse(BaseTester):
             ("0,0\n1,90\n2,180\n3,270", 2, r"got 90 at level 1 \(line 2\): multiply degrees by pi / 180"),
             ("level,drive\n0,0\n1,21845\n2,43690\n3,65535", 2, "do not give drive values for phases"),
             ("0\n21845\n43690\n65535", 2, "do not give drive values for phases"),
+            ("0,0\n1,21845\n2,43690\n3,65535", 2, r"such as '3,65535' may be a level and a whole number, or one phase"),
             ("0\n1\n2", 2, "must have 4 phases, one for each level of 2 bits, got 3"),
             ("0 0\n1 1\n3 6", 2, r"levels of a panel of 2 bits are 0 to 3, and 1 are missing \(2\): interpolate"),
             ("0 0\n1 1\n2 3\n2 5", 2, "level 2 is in line 3 and 4"),
