@@ -13,8 +13,10 @@ from types import ModuleType
 MOVED = {
     "app": "cli.app",
     "calibration": "lab.calibration",
+    "camera.image_types": "arrays",
     "coded_datasets": "training.coded_datasets",
     "commands": "cli.commands",
+    "data.opencv_arrays": "arrays",
     "inference": "reconstruction",
     "inference.capture_file": "lab.capture_file",
     "inference.compared_cameras": "design.compared_cameras",
