@@ -361,7 +361,7 @@ class RandomDepthBlur(DepthAugmentation):
         """Return blurred images. See :meth:`DepthAugmentation.change`."""
         if self.optics is not None:
             return self.optics(image, depth, field_center=params["field_center"])
-        if Mode.GRAPH not in torch_mode():
+        if Mode.GRAPH not in torch_mode() and depth.numel() and depth.device.type != "meta":
             _warn_of_unit(depth.detach())
         return depth_blur(image, depth, params["focus_distance"], params["f_number"], **self.flags)
 

@@ -200,10 +200,11 @@ def read_sample(
         lowest, highest = torch.aminmax(image.detach())
         if not bool((lowest >= 0) & (highest <= 1)):  # NaN too
             check_light(image, camera)
-    wide = compute_dtype(image.dtype, model.fidelity, image.device) == torch.float64
-    bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * (2 if wide else 1)
+    wide = model.fidelity.double or image.dtype == torch.float64
+    dtype = widest(image.device) if wide else torch.float32
+    bytes_at_once = BYTES_OF_TILES + BYTES_A_VALUE * image.numel() * dtype.itemsize // 4
     centers = () if field_center is None else check_centers(field_center, len(image))
-    sample = Sample(image, depth, form, batched, torch.float64 if wide else torch.float32, bytes_at_once, centers)
+    sample = Sample(image, depth, form, batched, dtype, bytes_at_once, centers)
     return filled_sample(sample) if camera.holes == "fill" and fills_holes(camera) else sample
 
 

@@ -173,7 +173,24 @@ def interpolated_bank(
     spacing = (nodes[-1] - nodes[0]) / (len(nodes) - 1)
     matrix = fine_layer_matrix(nodes[0], spacing, len(nodes), targets, band)
     psfs = (bank.psfs.new_tensor(matrix) @ bank.psfs.flatten(1)).unflatten(1, bank.psfs.shape[1:])
-    light = psfs.sum((2, 3))
-    psfs = psfs.clamp(min=0)  # nearer to the truth, and occlusion divides by sums of parts
-    psfs = psfs * (light / psfs.sum((2, 3)).clamp(min=1e-30))[..., None, None]
-    return PSFBank(psfs, psfs.new_tensor(targets), light)
+    return PSFBank(psfs, psfs.new_tensor(targets), psfs.sum((2, 3)))
+
+
+def not_negative(bank: PSFBank) -> PSFBank:
+    """Return interpolated PSFs without what interpolation put below zero, with the same light.
+
+    They are nearer to the truth then, and occlusion divides by sums of their parts. Planes of a basis of spectra may be
+    negative.
+
+    Args:
+        bank: PSFs that are intensities.
+
+    Example:
+        >>> import torch
+        >>> psfs = torch.tensor([-0.5, 1.0, 0.5]).reshape(1, 1, 1, 3)
+        >>> not_negative(PSFBank(psfs, torch.zeros(1), torch.ones(1, 1))).psfs.flatten()
+        tensor([0.0000, 0.6667, 0.3333])
+    """
+    psfs = bank.psfs.clamp(min=0)
+    scale = bank.energy / psfs.sum((2, 3)).clamp(min=1e-30)
+    return PSFBank(psfs * scale[..., None, None], bank.defocus, bank.energy)

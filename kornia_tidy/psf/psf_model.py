@@ -29,6 +29,7 @@ from kornia_tidy.psf.defocus_interpolation import (
     fine_nodes,
     interpolable_spacing,
     interpolated_bank,
+    not_negative,
 )
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.field import Field, check_center
@@ -294,7 +295,8 @@ class PSFModel:
         samples = tuple(nodes[0] + spacing * i for i in range(first, last + 1))
         bank = self._computed_bank(spectrum, dtype, samples, each_state, field=field)
         band = self._band() if kind == "bandlimited" else None
-        bank = interpolated_bank(bank, samples, targets, band).with_stray_light(*stray_light)
+        bank = interpolated_bank(bank, samples, targets, band)
+        bank = (bank if spectrum.basis else not_negative(bank)).with_stray_light(*stray_light)
         return bank if field is None else self._lit(bank, spectrum, field)
 
     def _warn_if_beyond(self, points: Sequence[tuple[float, float]], nodes: Sequence[float]) -> None:
@@ -395,7 +397,7 @@ class PSFModel:
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
-        amplitude = None if self._amplitude is None else self.pupil.amplitude
+        amplitude = None if self.aperture is None or self._amplitude is None else self.pupil.amplitude
         learning = learning or (amplitude is not None and torch.is_grad_enabled() and amplitude.requires_grad)
         exact = partial(self._exact_psfs, spectrum, grid, points=AXIS if field is None else field.points)
         build = partial(exact, states, weights, window=side, each_state=each_state)
@@ -476,7 +478,9 @@ class PSFModel:
         tolerance = self.fidelity.pixel_tolerance if tolerance is None else tolerance
         step = self.pixel_step * grid
         light = states, weights, pupil, spectrum, dispersion, nodes
-        plain = self._amplitude is not None or each_state  # compiled as plain operations
+        plain = (
+            self.aperture is not None and self._amplitude is not None
+        ) or each_state  # compiled as plain operations
         if torch_mode() == Mode.GRAPH and not (plain or isinstance(step, Tensor)):
             return operator_psf_bank(*light, step, window, tolerance, shift)
         return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._remembers)
@@ -509,7 +513,7 @@ class PSFModel:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
-            if self._amplitude is not None and self.lens is None:
+            if self.aperture is not None and self.lens is None:
                 weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
@@ -740,7 +744,7 @@ class PSFModel:
                 aperture = torch.ones(min(self.masks.phase.shape[-2:]), min(self.masks.phase.shape[-2:]))
             given = cast("Tensor | None", aperture)
             pupil = self._derived.pupil = pupil_over(self.masks.phase.shape, given, fill_factor)
-        if (amplitude := self._amplitude) is None:
+        if self.aperture is None or (amplitude := self._amplitude) is None:
             return pupil
         shown = self.state if self.moment is None else self.moment
         if self.lens is None:
@@ -813,7 +817,7 @@ class PSFModel:
         camera, known, step = self.camera, self._derived.window, self.pixel_step
         if self.measured is not None or self.lens is not None or self.spectrum.basis is not None:
             return None
-        if self._amplitude is not None:
+        if self.aperture is not None and self._amplitude is not None:
             return None
         if not self.fidelity.blurs_by_rays:
             return None

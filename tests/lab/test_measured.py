@@ -60,7 +60,8 @@ class TestClosedFormSystem(BaseTester):
     def test_feature_a_folder_holds_psfs_of_several_places(self, psfs, tmp_path):
         system = closed_form_system(psfs, SENSOR, "tikhonov")
         turned = replace(psfs.bank, psfs=psfs.bank.psfs.flip(-1))
-        system.optics = system.optics.with_bank(FieldBank.from_measured([psfs.bank, turned], [(0, 0), (0, 300)]))
+        places = FieldBank.from_measured([psfs.bank, turned], [(0, 0), (0, 300)])
+        system = system._replace(optics=system.optics.with_bank(places))
         again = from_pretrained(save_pretrained(system, tmp_path / "mine"))
         image, depth = torch.rand(1, 3, 40, 40), torch.full((1, 1, 40, 40), 0.6)
         system.optics.sensor = again.optics.sensor = None

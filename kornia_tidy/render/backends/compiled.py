@@ -132,8 +132,8 @@ class _Sums:
         self.size, self.places, self.terms = window_size(scene.psfs.shape[-1]), (), 0
         if scene.field is not None:
             self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
-        elif scene.compositing == "gather" and _fits(scene, gather_ops.smallest_output(scene.image.dtype)):
-            self.terms = _terms(self.psfs)
+        elif scene.compositing == "gather" and (terms := _terms(self.psfs)):
+            self.terms = terms * _fits(scene, gather_ops.smallest_output(scene.image.dtype))
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         if self.terms:
