@@ -332,10 +332,10 @@ class TestAgainstReference(BaseTester):
     @pytest.mark.parametrize(
         ("file", "name", "f_number", "masked", "bare"),
         [
-            ("single_f17.6", "single-50mm", 17.6, 3e-3, 1e-3),
-            ("double_gauss_f17.6", "double-gauss-50mm", 17.6, 6e-3, 2e-3),
-            ("double_gauss_f8.0", "double-gauss-50mm", 8.0, 2e-3, 1e-3),
-            ("triplet_f8.0", "triplet-50mm", 8.0, 2e-3, 1e-3),
+            ("single_f17.6", "single-50mm", 17.6, 4e-3, 2e-3),
+            ("double_gauss_f17.6", "double-gauss-50mm", 17.6, 6e-3, 3e-3),
+            ("double_gauss_f8.0", "double-gauss-50mm", 8.0, 3e-3, 2e-3),
+            ("triplet_f8.0", "triplet-50mm", 8.0, 3e-3, 2e-3),
             ("phone_f5.6", "phone-5.5mm", 5.6, 1e-2, 1e-2),
         ],
     )
@@ -365,7 +365,7 @@ class TestAgainstReference(BaseTester):
                 for c in range(3):
                     assert error(own[0][c], torch.from_numpy(known["masked"][d, f, c])) < masked
                 if "masked_joined_530" in known:
-                    assert error(own[0][1], torch.from_numpy(known["masked_joined_530"][d, f])) < 2e-3
+                    assert error(own[0][1], torch.from_numpy(known["masked_joined_530"][d, f])) < 3e-3
                 assert error(own[1][1], torch.from_numpy(known["bare"][d, f])) < bare
 
     def test_feature_light_in_the_picture(self):
