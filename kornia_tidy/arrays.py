@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_float_tensor, check_positive, described, unmasked
-
-if TYPE_CHECKING:
-    from numpy.typing import DTypeLike
 
 FAR_WHOLE = 500.0  # m; nearer depths may well be stored as whole numbers of several metres each
 FARTHEST = 1e5  # m; a farther pixel is sky, whose value no depth map in millimetres reaches
@@ -126,7 +123,7 @@ def cropped_image(image: Any, margin: int) -> Any:
     return image.crop((margin, margin, image.width - margin, image.height - margin))
 
 
-def to_opencv(image: Tensor, dtype: DTypeLike = np.uint8) -> np.ndarray:
+def to_opencv(image: Tensor, dtype: type | np.dtype = np.uint8) -> np.ndarray:
     """Convert a tensor to an OpenCV picture.
 
     Args:

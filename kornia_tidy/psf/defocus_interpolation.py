@@ -187,8 +187,9 @@ def not_negative(bank: PSFBank) -> PSFBank:
 
     Example:
         >>> import torch
-        >>> psfs = torch.tensor([-0.5, 1.0, 0.5]).reshape(1, 1, 1, 3)
-        >>> not_negative(PSFBank(psfs, torch.zeros(1), torch.ones(1, 1))).psfs.flatten()
+        >>> psfs = torch.zeros(1, 1, 3, 3)
+        >>> psfs[0, 0, 1] = torch.tensor([-0.5, 1.0, 0.5])
+        >>> not_negative(PSFBank(psfs, torch.zeros(1), torch.ones(1, 1))).psfs[0, 0, 1]
         tensor([0.0000, 0.6667, 0.3333])
     """
     psfs = bank.psfs.clamp(min=0)

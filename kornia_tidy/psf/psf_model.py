@@ -513,7 +513,7 @@ class PSFModel:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
-            if self.aperture is not None and self.lens is None:
+            if self.lens is None and self.aperture is not None and self._amplitude is not None:
                 weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
