@@ -69,6 +69,8 @@ SIDE = 7  # of pixelwise masks
 # Rounding of a capture in linear light, full scale 1, when its sums are made in another order: transforms of some
 # thousand values in [0, 1] with unit round-off 6e-8 (1.1e-16); see also `loosened`.
 ROUNDING = {torch.float32: 4e-6, torch.float64: 1e-12}
+# PSFs are computed in float64 for several depths by one product of matrices: the last bits follow from which these are.
+_LAST_BITS = {torch.float32: 0.0, torch.float64: 1e-15}
 
 
 class Choose(Protocol):
@@ -616,6 +618,8 @@ def draw_history(choose: Choose) -> History:
         size = 22, 48
     if wide:  # wide enough for the windows
         size = max(size[0], 56), 168 if way == "far away" else 60
+    if camera.fidelity.propagation == "paper":  # whose PSFs the border "valid" needs whole
+        size = max(size[0], 25), size[1]
     channels = 1 if camera.spectrum == "monochrome" else choose((3, 3, 1))
     events = tuple(choose([name for name in EVENTS if name not in left_out]) for _ in range(choose((1, 2, 3))))
     dtype = choose((torch.float32, torch.float32, torch.float64))
@@ -630,7 +634,7 @@ class Finding:
 
     Args:
         difference: largest, full scale 1.
-        bound: that it may have; 0 where bits must agree.
+        bound: that it may have; 0 where bits must agree, as in float32.
     """
 
     difference: float
@@ -670,7 +674,7 @@ def _live(history: History) -> Finding:
         EVENTS[name](life)
     coded, columns, to_the_bit = WAYS[history.way](life, noise)
     difference = float((coded.double() - expected.double())[..., columns].abs().max())
-    return Finding(difference, 0.0 if to_the_bit else bound_of(history))
+    return Finding(difference, _LAST_BITS[rounding_of(history)] if to_the_bit else bound_of(history))
 
 
 def main() -> int:
@@ -707,10 +711,15 @@ def main() -> int:
     return failed > 0
 
 
+def rounding_of(history: History) -> torch.dtype:
+    """Return the data type that a capture is computed in."""
+    double = history.dtype == torch.float64 or history.camera.fidelity.double
+    return torch.float64 if double else torch.float32
+
+
 def bound_of(history: History) -> float:
     """Return how far captures may be apart whose sums are made in another order, full scale 1."""
-    double = history.dtype == torch.float64 or history.camera.fidelity.double
-    bound = ROUNDING[torch.float64 if double else torch.float32]
+    bound = ROUNDING[rounding_of(history)]
     if history.camera.sensor == "bits":
         return 1 / 255 + bound  # rounding may decide for the next level
     return bound
