@@ -279,8 +279,8 @@ class TiDyOptics(CameraState):
             sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
         """
         size = sample.image.shape[-2], sample.image.shape[-1]
-        known = self.lens is None and self.psf_model.measured is None
-        centers = () if known else sample.centers or (self.field_center,)
+        alike = self.lens is None and self.psf_model.measured is None  # PSFs all over the picture
+        centers = () if alike else sample.centers or (self.field_center,)
         found = [self.psf_model.field_of(size, center) for center in centers]
         fields = tuple(field for field in found if field is not None)
         rows = self._rows_at_once(sample, fields) if sample.bytes_at_once > self.memory_budget // 2 else None

@@ -19,7 +19,7 @@ from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
 from kornia_tidy.psf.measured_field import place_weights
-from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank
+from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank, bank_of_file
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 from kornia_tidy.tensor_files import read_tensors
 
@@ -153,12 +153,7 @@ class FieldBank:
         if notes.get("format") != _FORMAT or not needed <= set(tensors) <= {*needed, "veil"}:
             found = f"{notes.get('format')!r:.40} with {sorted(tensors)!r:.200}"
             raise ValueError(f"{path} is not a PSF bank over the field: its format is {found}")
-        for name, value in tensors.items():
-            check_finite(f"{name} of {path}", value)
-        try:
-            return cls(**tensors)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from None
+        return bank_of_file(cls, tensors, path)
 
     @classmethod
     def from_measured(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from safetensors.torch import save
@@ -13,6 +14,8 @@ from torch import Tensor
 from kornia_tidy.checks import check_choice, check_finite, check_values
 from kornia_tidy.files import write_bytes
 from kornia_tidy.tensor_files import read_tensors
+
+T = TypeVar("T")
 
 STRAY_LIGHT = ("renormalize", "veil", "discard")
 TAILS = 1e-3  # of a PSF's light, see PSFBank.with_tails
@@ -199,12 +202,7 @@ class PSFBank:
         form, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
         if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:
             raise ValueError(f"{path} is not a PSF bank: its format is {form!r:.40} with {sorted(tensors)!r:.200}")
-        for name, value in tensors.items():
-            check_finite(f"{name} of {path}", value)
-        try:
-            return cls(**tensors)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from None
+        return bank_of_file(cls, tensors, path)
 
     @classmethod
     def from_measured(cls, psfs: Tensor, defocus: Tensor) -> PSFBank:
@@ -251,3 +249,22 @@ def enclosing_window(psfs: Tensor, share: float) -> int | None:
     rings = psfs.new_zeros(*psfs.shape[:-2], size // 2 + 1).index_add(-1, ring, psfs.flatten(-2))
     held = rings.cumsum(-1).reshape(-1, size // 2 + 1).amin(0) >= share
     return 2 * int(held.long().argmax()) + 1 if bool(held.any()) else None
+
+
+def bank_of_file(kind: Callable[..., T], tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> T:
+    """Return a bank of the tensors of a file.
+
+    Args:
+        kind: class of the bank.
+        tensors: its parts by their names.
+        path: of the file, for the message.
+
+    Raises:
+        ValueError: if a value is NaN or infinite, or the parts do not fit.
+    """
+    for name, value in tensors.items():
+        check_finite(f"{name} of {path}", value)
+    try:
+        return kind(**tensors)
+    except ValueError as error:
+        raise ValueError(f"cannot read {path}: {error}") from None
