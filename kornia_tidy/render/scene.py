@@ -7,9 +7,8 @@ and a layer weight, the fraction of the way to the next node. All weights follow
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -77,7 +76,6 @@ class LayeredScene:
         sorted_layers: layer index and layer weight of the pixels that are sorted, and
         labels: the same for each image of the batch, without gradients.
         field: where over the picture PSFs are known, or None for PSFs that are the same everywhere.
-        found: values that follow from the scene, by their names, so that they are made once.
     """
 
     image: Tensor
@@ -91,7 +89,6 @@ class LayeredScene:
     sorted_layers: tuple[Tensor, Tensor | None]
     labels: Labels
     field: Field | None = None
-    found: dict[str, Any] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -104,13 +101,11 @@ class LayeredScene:
         """Height and width of :attr:`plane`."""
         return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
 
-    @property
+    @cached_property
     def plane(self) -> Tensor:
         """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels."""
-        if "plane" not in self.found:
-            margin, image = (self.psfs.shape[-1] // 2,) * 4, self.image
-            self.found["plane"] = image if self.border == "valid" else pad(image, margin, PAD_MODES[self.border])
-        return self.found["plane"]
+        margin = (self.psfs.shape[-1] // 2,) * 4
+        return self.image if self.border == "valid" else pad(self.image, margin, PAD_MODES[self.border])
 
     @property
     def batch_weight(self) -> Tensor | None:
@@ -118,35 +113,31 @@ class LayeredScene:
         weight = self.sorted_layers[1]
         return None if weight is None else weight.expand(len(self.image), -1, -1)
 
-    @property
+    @cached_property
     def places(self) -> Places:
         """Tiles over the field and the nodes' weights there: at the pixels that see, for scatter at those of the light.
 
         Tiles are as large as suits the PSFs, but not larger than the field's cells. Those of occlusion are small, and
         without gradients along an axis where PSFs hardly change in them.
         """
-        if "places" not in self.found:
-            assert self.field is not None
-            side, origin, occludes = self.psfs.shape[-1], self.field.origin, self.compositing == "occlusion"
-            scatters, valid = self.compositing == "scatter", self.border == "valid"
-            sides, beyond = (self.padded_size, side // 2) if scatters else (self.output_size, 0)
-            moved = side // 2 * (valid - scatters)
-            most = TILE if occludes else (min(self.field.cell, window_size(side) - side + 1),) * 2
-            rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond) for i in (0, 1))
-            places = Places(*rows, *columns)
-            if occludes:
-                for weights, pixels in ((places.row_weights, TILE[0]), (places.column_weights, TILE[1])):
-                    weights[:, 1] *= pixels > self.field.still
-            self.found["places"] = places
-        return self.found["places"]
+        assert self.field is not None
+        side, origin, occludes = self.psfs.shape[-1], self.field.origin, self.compositing == "occlusion"
+        scatters, valid = self.compositing == "scatter", self.border == "valid"
+        sides, beyond = (self.padded_size, side // 2) if scatters else (self.output_size, 0)
+        moved = side // 2 * (valid - scatters)
+        most = TILE if occludes else (min(self.field.cell, window_size(side) - side + 1),) * 2
+        rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond) for i in (0, 1))
+        places = Places(*rows, *columns)
+        if occludes:
+            for weights, pixels in ((places.row_weights, TILE[0]), (places.column_weights, TILE[1])):
+                weights[:, 1] *= pixels > self.field.still
+        return places
 
-    @property
+    @cached_property
     def sampled_layers(self) -> int:
         """Number of layers in a sample of the scene: every eighth row and column of :attr:`labels`."""
-        if "sampled_layers" not in self.found:
-            terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
-            self.found["sampled_layers"] = int((torch.bincount(torch.cat(terms)) > 0).sum())
-        return self.found["sampled_layers"]
+        terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
+        return int((torch.bincount(torch.cat(terms)) > 0).sum())
 
 
 def layered_scene(
