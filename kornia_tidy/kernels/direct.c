@@ -22,21 +22,19 @@
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
-enum { PIECE_ROWS = 32, PIECE_BLOCKS = 32 };  // blocks whose correlations share one sum
 enum { TILE_ROWS = 16, TILE_COLUMNS = 256 };  // of pixels that share sums of columns, which stay in the cache
 enum { RUN = 5 };  // terms in adjacent rows that are added together
 
 // The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {
-    int64_t images, channels, height, width, layers, side, threads, slabs;
+    int64_t images, channels, height, width, layers, side, threads;
     int64_t plane_image, plane_channel, plane_row, index_image, index_row, weight_image, weight_row;
     int64_t weight_gradient;    // 0: blend by weights; 1: the next layer less the pixel's own
     const REAL *plane;          // light, larger by side - 1
     const REAL *psfs;           // (layers, channels, side, side), flipped, columns first
     const int64_t *index;       // (images, height, width)
     const REAL *weight;         // like index, or null
-    const REAL *gradient;       // (images, channels, height, width): of what `mix` returns, for `correlate`
-    REAL *out;                  // mix: (images, channels, height, width); correlate: zeros (slabs, layers, channels, side, side)
+    REAL *out;                  // (images, channels, height, width)
 } scene;
 
 // A layer present in a block, with a bit mask of its strips: 1 left, 2 right, 3 both.
@@ -276,123 +274,5 @@ int mix(const scene *s) {
         free(d.seen), free(d.sums), free(d.total);
     }
     free_terms(&t);
-    return failed;
-}
-
-// Adds the correlation of strips with the light for `count` rows of PSF samples: sum over pixels of own times light.
-INLINE void correlate_rows(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, int strips, int count,
-                           vec *sums) {
-    for (int64_t j = 0; j < side; j++) {
-        vec total[ROWS];
-#pragma GCC unroll 4
-        for (int k = 0; k < count; k++) total[k] = sums[k * side + j];
-#pragma GCC unroll 2
-        for (int strip = 0; strip < strips; strip++)
-#pragma GCC unroll 7
-            for (int r = 0; r < ROWS + count - 1; r++) {
-                vec x = *(const loose *)(light + r * pitch + j + strip * LANES);
-#pragma GCC unroll 4
-                for (int k = 0; k < count; k++)
-                    if (r - k >= 0 && r - k < ROWS) total[k] += own[strip][r - k] * x;
-            }
-#pragma GCC unroll 4
-        for (int k = 0; k < count; k++) sums[k * side + j] = total[k];
-    }
-}
-
-INLINE void correlate_with(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, int strips, vec *sums) {
-    int64_t k = 0;
-    for (; k + 4 <= side; k += 4) correlate_rows(light + k * pitch, pitch, own, side, strips, 4, sums + k * side);
-    light += k * pitch, sums += k * side;
-    if (side - k == 3) correlate_rows(light, pitch, own, side, strips, 3, sums);  // a side is odd
-    if (side - k == 1) correlate_rows(light, pitch, own, side, strips, 1, sums);
-}
-
-static void correlate_strip(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, vec *sums) {
-    correlate_with(light, pitch, own, side, 1, sums);
-}
-
-static void correlate_block(const REAL *light, int64_t pitch, const vec own[2][ROWS], int64_t side, vec *sums) {
-    correlate_with(light, pitch, own, side, 2, sums);
-}
-
-// Position of a block in a piece, with its layers members[start] to members[stop - 1].
-typedef struct {
-    int64_t y, x, skip_rows, skip_columns, start, stop;
-} place;
-
-// Correlates the pixels of a piece in one layer and channel with the light, summed over the piece.
-static void correlate_piece(const scene *s, int64_t image, int64_t channel, int64_t layer, const place *places, int count,
-                            const member *members, vec *sums) {
-    const REAL *plane = s->plane + image * s->plane_image + channel * s->plane_channel;
-    const REAL *gradient = s->gradient + (image * s->channels + channel) * s->height * s->width;
-    memset(sums, 0, s->side * s->side * sizeof(vec));
-    for (const place *p = places; p < places + count; p++)
-        for (int64_t n = p->start; n < p->stop; n++) {
-            if (members[n].layer != layer) continue;
-            int first = members[n].strips == 2, last = members[n].strips != 1;
-            vec weights[2][ROWS];
-            labels l;
-            read_labels(s, s->index + image * s->index_image + p->y * s->index_row + p->x,
-                        s->weight ? s->weight + image * s->weight_image + p->y * s->weight_row + p->x : 0, &l);
-            for (int strip = first; strip <= last; strip++) {
-                int64_t x = p->x + strip * LANES;
-                weigh(s, &l, strip, layer, weights[strip]);
-                for (int v = 0; v < ROWS; v++) weights[strip][v] *= *(const loose *)(gradient + (p->y + v) * s->width + x);
-                // Pixels of the overlap belong to the previous blocks.
-                if (p->skip_rows || p->skip_columns)
-                    for (int v = 0; v < ROWS; v++)
-                        for (int i = 0; i < LANES; i++)
-                            if (v < p->skip_rows || strip * LANES + i < p->skip_columns) weights[strip][v][i] = 0;
-            }
-            const REAL *light = plane + p->y * s->plane_row + p->x;
-            if (members[n].strips == 3) correlate_block(light, s->plane_row, weights, s->side, sums);
-            else correlate_strip(light + first * LANES, s->plane_row, weights + first, s->side, sums);
-        }
-}
-
-// Computes the gradient in the PSFs: for each sample of each layer's PSF the correlation of the layer's pixels with the
-// light, in separate sums for slabs of rows. Returns 0, or 2 if there is no memory.
-int correlate(const scene *s) {
-    int64_t bands = (s->height + ROWS - 1) / ROWS, blocks = (s->width + WIDTH - 1) / WIDTH, area = s->side * s->side;
-    int64_t all = s->images * bands, failed = 0;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
-    for (int64_t slab = 0; slab < s->slabs; slab++) {
-        place places[PIECE_ROWS * PIECE_BLOCKS];
-        member *members = malloc(sizeof(member) * PIECE_ROWS * PIECE_BLOCKS * TERMS);
-        uint8_t *present = malloc(s->layers + 1), *seen = calloc(1, 2 * (s->layers + 1));
-        vec *sums = aligned_alloc(sizeof(vec), area * sizeof(vec));
-        if (!members || !present || !seen || !sums) {
-#pragma omp atomic write
-            failed = 2;
-        } else
-            for (int64_t top = all * slab / s->slabs, next; top < all * (slab + 1) / s->slabs; top = next) {
-                int64_t image = top / bands;
-                next = least(least(top + PIECE_ROWS, all * (slab + 1) / s->slabs), (image + 1) * bands);
-                for (int64_t left = 0; left < blocks; left += PIECE_BLOCKS) {
-                    int count = 0;
-                    int64_t end = 0;
-                    memset(present, 0, s->layers + 1);
-                    for (int64_t band = top; band < next; band++)
-                        for (int64_t block = left; block < least(left + PIECE_BLOCKS, blocks); block++) {
-                            int64_t y = least(band % bands * ROWS, s->height - ROWS);
-                            int64_t x = least(block * WIDTH, s->width - WIDTH);
-                            int found = list_members(
-                                s, s->index + image * s->index_image + y * s->index_row + x,
-                                s->weight ? s->weight + image * s->weight_image + y * s->weight_row + x : 0, seen, members + end);
-                            for (int n = 0; n < found; n++) present[members[end + n].layer] = 1;
-                            places[count++] = (place){y, x, band % bands * ROWS - y, block * WIDTH - x, end, end + found};
-                            end += found;
-                        }
-                    for (int64_t layer = 0; layer < s->layers; layer++)
-                        for (int64_t c = 0; present[layer] && c < s->channels; c++) {
-                            correlate_piece(s, image, c, layer, places, count, members, sums);
-                            REAL *out = s->out + ((slab * s->layers + layer) * s->channels + c) * area;
-                            for (int64_t n = 0; n < area; n++) out[n] += sum_of(sums[n]);
-                        }
-                }
-            }
-        free(members), free(present), free(seen), free(sums);
-    }
     return failed;
 }

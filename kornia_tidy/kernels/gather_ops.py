@@ -1,7 +1,6 @@
-"""Operators of gather by direct convolution: blurred light, and the gradient of the PSFs, in C.
+"""Operator of gather by direct convolution, in C: through PSFs of few pixels, discs and other PSFs of few terms.
 
-Light is gathered through PSFs of few pixels, and through discs and other PSFs of few terms (:func:`count_terms`).
-The renderer makes the gradient of the light, a transposed convolution, by the windows of ``overlap_ops.py``.
+The renderer makes the gradients of light and PSFs by the windows of ``overlap_ops.py``.
 """
 
 from __future__ import annotations
@@ -14,14 +13,12 @@ from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import KERNELS, load
 from kornia_tidy.kernels.operators import Parameters, define
-from kornia_tidy.kernels.scene_checks import check_smallest, new_pixels, new_psfs, refuse_layer
+from kornia_tidy.kernels.scene_checks import check_smallest, new_pixels, refuse_layer
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "direct.c"
 NO_LAYER, NO_MEMORY = 1, 2  # status of the functions
 STRIP_ROWS = 4  # of a strip of pixels, see direct.c
-SLABS = 4  # partial sums of a correlation for each thread: enough for all threads to end together
-SLAB_BYTES = 64 << 20  # limit of the memory of all partial sums
 
 
 def gather_direct(
@@ -56,27 +53,6 @@ def gather_direct(
     return torch.ops.kornia_tidy.gather_direct(plane, psfs, layer_index, layer_weight, weight_gradient)
 
 
-def gather_direct_psf_gradient(
-    plane: Tensor, pixels: Tensor, layer_index: Tensor, layer_weight: Tensor | None, layers: int
-) -> Tensor:
-    """Correlate a plane with the gradient of each layer's pixels: the gradient of gather with respect to the PSFs.
-
-    Args:
-        plane: (B, C, H + P - 1, W + P - 1) light, as for :func:`gather_direct`.
-        pixels: (B, C, H, W) gradient of what :func:`gather_direct` returns.
-        layer_index: (B, H, W), as there.
-        layer_weight: (B, H, W), as there, or None.
-        layers: number of layers D.
-
-    Returns:
-        (D, C, P, P), summed in the same order every time. It has no gradient.
-
-    Raises:
-        MemoryError: if memory for the sums is missing; otherwise as :func:`gather_direct`.
-    """
-    return torch.ops.kornia_tidy.gather_direct_psf_gradient(plane, pixels, layer_index, layer_weight, layers)
-
-
 def count_terms(psfs: Tensor) -> int:
     """Return the number of terms of all PSFs: as direct.c counts them, except that all PSFs take them of the same kind.
 
@@ -107,27 +83,10 @@ class _Scene(Parameters):
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
-        *((name, ctypes.c_int64) for name in ("slabs", "plane_image", "plane_channel", "plane_row", "index_image")),
+        *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "index_image")),
         *((name, ctypes.c_int64) for name in ("index_row", "weight_image", "weight_row", "weight_gradient")),
-        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "gradient", "out")),
+        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "out")),
     )
-
-
-def _scene(
-    plane: Tensor, layer_index: Tensor, layer_weight: Tensor | None, layers: int, side: int, **more: int
-) -> _Scene:
-    (images, height, width), channels = layer_index.shape, plane.shape[1]
-    scene = _Scene(images=images, channels=channels, height=height, width=width, layers=layers, side=side, **more)
-    scene.point_to(plane=plane, index=layer_index, weight=layer_weight)
-    return scene
-
-
-def _call(function: str, scene: _Scene, dtype: torch.dtype) -> None:
-    status = getattr(load(SOURCE, dtype), function)(ctypes.byref(scene))
-    if status == NO_LAYER:
-        refuse_layer(scene.layers)
-    if status == NO_MEMORY:
-        raise MemoryError(f"no memory for PSFs of {scene.side}x{scene.side} pixels")
 
 
 def _new_light(
@@ -142,28 +101,16 @@ def _gather(
     plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, weight_gradient: bool
 ) -> Tensor:
     light = _new_light(plane, psfs, layer_index, layer_weight, weight_gradient)
-    scene = _scene(plane, layer_index, layer_weight, len(psfs), psfs.shape[-1], weight_gradient=weight_gradient)
-    scene.point_to(psfs=psfs.flip((-2, -1)).mT, out=light)
-    _call("mix", scene, plane.dtype)
+    (images, channels, height, width), (layers, side) = light.shape, psfs.shape[::3]
+    numbers = {"images": images, "channels": channels, "height": height, "width": width, "layers": layers, "side": side}
+    scene = _Scene(weight_gradient=weight_gradient, **numbers)
+    scene.point_to(plane=plane, index=layer_index, weight=layer_weight, psfs=psfs.flip((-2, -1)).mT, out=light)
+    status = load(SOURCE, plane.dtype).mix(ctypes.byref(scene))
+    if status == NO_LAYER:
+        refuse_layer(layers)
+    if status == NO_MEMORY:
+        raise MemoryError(f"no memory for PSFs of {side}x{side} pixels")
     return light
-
-
-def _new_psfs(plane: Tensor, pixels: Tensor, layer_index: Tensor, layer_weight: Tensor | None, layers: int) -> Tensor:
-    psfs = new_psfs(plane, pixels, layer_index, layer_weight, layers)
-    check_smallest(pixels.shape, smallest_output(pixels.dtype))
-    return psfs
-
-
-def _psf_gradient(
-    plane: Tensor, pixels: Tensor, layer_index: Tensor, layer_weight: Tensor | None, layers: int
-) -> Tensor:
-    psfs = _new_psfs(plane, pixels, layer_index, layer_weight, layers)
-    slabs = max(1, min(SLABS * torch.get_num_threads(), SLAB_BYTES // max(psfs.nbytes, 1)))
-    sums = psfs.new_zeros(slabs, *psfs.shape)
-    scene = _scene(plane, layer_index, layer_weight, layers, psfs.shape[-1], slabs=slabs)
-    scene.point_to(gradient=pixels, out=sums)
-    _call("correlate", scene, plane.dtype)
-    return sums.sum(0).flip((-2, -1))
 
 
 define(
@@ -171,10 +118,4 @@ define(
     "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, bool weight_gradient) -> Tensor",
     _gather,
     _new_light,
-)
-define(
-    "gather_direct_psf_gradient",
-    "(Tensor plane, Tensor pixels, Tensor layer_index, Tensor? layer_weight, SymInt layers) -> Tensor",
-    _psf_gradient,
-    _new_psfs,
 )

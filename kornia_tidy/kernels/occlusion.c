@@ -19,9 +19,12 @@
 //
 // Compiled by build.py with REAL as float or double.
 
-#include "direct.c"
+#include <stdlib.h>
 
-enum { BAND = 8, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
+#include "vectors.h"
+#include "field.h"
+
+enum { BAND = 8, WIDTH = 2 * LANES, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
 enum { STRIPS = REGISTERS / 16, EDGE_ROWS = REGISTERS / 4 };  // whose sums stay in registers
 
 typedef double dvec __attribute__((vector_size(VECTOR_BYTES)));

@@ -120,25 +120,6 @@ def gather(draw: random.Random) -> Call:
     return Call(about, "gather_direct", arguments, scene.products, truth)
 
 
-def correlate(draw: random.Random) -> Call:
-    """``correlate`` of direct.c: the gradient of a sum over pixels to the PSFs."""
-    scene = _gathered(draw)
-    own = torch.randn(len(scene.light), scene.light.shape[1], *scene.lower.shape[-2:], dtype=scene.light.dtype)
-    if draw.random() < 0.3:
-        own = own.transpose(-2, -1).contiguous().transpose(-2, -1)
-
-    def truth() -> tuple[Tensor, Tensor]:
-        sums = []
-        for x in (Tensor.double, _magnitudes):
-            psfs = x(scene.psfs).requires_grad_()
-            coded = _mixed(x(scene.light), psfs, x(_weights(scene)))
-            sums.append(torch.autograd.grad((coded * x(own)).sum(), psfs)[0])
-        return sums[0], 2 * gamma(own.numel() + 4, own.dtype) * sums[1]
-
-    arguments = scene.light, own, scene.lower, scene.fraction, len(scene.psfs)
-    return Call(scene.about, "gather_direct_psf_gradient", arguments, scene.products, truth)
-
-
 def overlap_gather(draw: random.Random) -> Call:
     """``gather`` of overlap.c."""
     return _overlap_gather(draw, _overlapping(draw))
@@ -710,7 +691,6 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "overlap.c: scatter over the field": field_scatter,
     "overlap.c: correlate over the field": field_correlate,
     "direct.c: gather": gather,
-    "direct.c: correlate": correlate,
     "occlusion.c: light": occlude,
     "occlusion.c: gradient": occlude_gradient,
     "occlusion.c: light over the field": field_occlude,

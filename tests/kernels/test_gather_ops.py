@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy.augmentation.depth_blur import disc
-from kornia_tidy.kernels.gather_ops import SOURCE, count_terms, gather_direct, gather_direct_psf_gradient
+from kornia_tidy.kernels.gather_ops import SOURCE, count_terms, gather_direct
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import SceneOperatorTester, needs_compiler
 
@@ -112,33 +112,6 @@ class TestGatherDirect(SceneOperatorTester):
     def test_exception(self, changes, error, words):
         with pytest.raises(error, match=words):
             gather_direct(**scene(**changes))
-
-
-class TestGatherDirectPsfGradient(SceneOperatorTester):
-    draw = staticmethod(kernel_shapes.correlate)
-    source = SOURCE
-
-    def smallest(self):
-        given = scene()
-        labels = given["layer_index"], given["layer_weight"]
-        return gather_direct_psf_gradient(given["plane"], torch.randn(2, 2, 5, 16, dtype=torch.float64), *labels, 3)
-
-    @needs_compiler
-    def test_feature_layers_without_a_pixel_have_no_gradient(self):
-        given = scene(layer_index=torch.ones(2, 5, 16, dtype=torch.int64), layer_weight=None)
-        gradient = torch.randn(2, 2, 5, 16, dtype=torch.float64)
-        got = gather_direct_psf_gradient(given["plane"], gradient, given["layer_index"], None, 3)
-        assert [bool(layer.any()) for layer in got] == [False, True, False]
-
-    def test_exception_the_gradient_is_of_another_size(self):
-        given = scene()
-        labels = given["layer_index"], given["layer_weight"]
-        with pytest.raises(ValueError, match=r"pixels must have shape \(2, 2, 5, 16\), got \(2, 1, 5, 16\)"):
-            gather_direct_psf_gradient(given["plane"], torch.randn(2, 1, 5, 16, dtype=torch.float64), *labels, 3)
-        with pytest.raises(TypeError, match=r"pixels must be of the light's dtype torch.float64, got torch.float32"):
-            gather_direct_psf_gradient(given["plane"], torch.randn(2, 2, 5, 16), *labels, 3)
-        with pytest.raises(ValueError, match="PSFs must have an odd side of at least 1 pixel, got 2"):
-            gather_direct_psf_gradient(given["plane"], torch.randn(2, 2, 6, 17, dtype=torch.float64), *labels, 3)
 
 
 @needs_compiler

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops, overlap_ops
 from kornia_tidy.kernels.build import REALS, compiled
-from kornia_tidy.kernels.gather_ops import count_terms, gather_direct, gather_direct_psf_gradient
+from kornia_tidy.kernels.gather_ops import count_terms, gather_direct
 from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct_gradients
 from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient, scatter_overlap, window_size
 from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
@@ -146,8 +146,6 @@ class _Sums:
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         given = plane, pixels, *self.labels, self.psfs.shape[-4]
-        if self.terms and self.psfs.shape[-1] <= LARGEST_DIRECT:
-            return gather_direct_psf_gradient(*given)
         found = overlap_psf_gradient(*given, self.size, correlate=correlate, places=self.places)
         return found.flatten(0, 1) if self.places else found
 
