@@ -138,9 +138,8 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
     if not value.is_floating_point():
-        raise TypeError(
-            f"{name} must be floating point with values in [0, 1] or metres, got {value.dtype}{_as_float(name, value)}"
-        )
+        unit = {"depth": " in metres", "image": " with values in [0, 1]"}.get(name.removesuffix("s"), "")
+        raise TypeError(f"{name} must be floating point{unit}, got {value.dtype}{_as_float(name, value)}")
     if value.is_meta:
         check_values(name, value)
     if value.ndim != rank:

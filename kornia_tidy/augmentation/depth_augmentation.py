@@ -18,6 +18,7 @@ from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.optics.units import check_depth_fits
 
 _PIXELWISE = ("kornia.color", "kornia.enhance", "kornia.filters")  # packages whose modules move no pixel
 HALVES = (torch.float16, torch.bfloat16)
@@ -220,15 +221,10 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         return changed_rows(input, params, self.p == 1 and self.p_batch == 1, change)
 
     def _depth_of(self, image: Tensor) -> Tensor:
-        name = type(self).__name__
-        depth = self.depth_tap.take(image, name) if self.bound is None else self.bound
+        depth = self.depth_tap.take(image, type(self).__name__) if self.bound is None else self.bound
         check_float_tensor("depth", depth, depth.ndim, "(B, 1, H, W)")
         depth = depth[None] if depth.ndim == 3 else depth
-        if depth.shape[1:] != (1, *image.shape[-2:]) or depth.shape[0] not in (1, image.shape[0]):
-            raise ValueError(
-                f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image in {name}, got "
-                f"{tuple(depth.shape)}"
-            )
+        check_depth_fits(depth, image)
         return depth.to(image.device, torch.promote_types(depth.dtype, torch.float32))
 
     def __getstate__(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, PITCHES, ThinLensCamera
-from kornia_tidy.optics.units import misread_depth, warn_once
+from kornia_tidy.optics.units import check_depth_fits, check_image, misread_depth, warn_once
 from kornia_tidy.render.compositing import render
 
 _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
@@ -102,7 +102,8 @@ def depth_blur(
 
     Raises:
         TypeError: if image or depth are not floating-point tensors.
-        ValueError: if shapes do not fit, a depth is not positive, or a setting is out of its range.
+        ValueError: if shapes do not fit, a depth is not positive, the image has NaN or sRGB values above 16, or a
+            setting is out of its range.
 
     Convention:
         - Geometrical optics: no diffraction. A radius below half a pixel is sharp. For phase masks and diffraction see
@@ -129,8 +130,12 @@ def depth_blur(
         if isinstance(value, Tensor) and value.numel() not in (1, len(image)):
             raise ValueError(f"{name} must be one number or one for each of {len(image)} images, got {value.numel()}")
     _check_lens(focus_distance, f_number, focal_length, pixel_pitch, max_radius, compositing, color_space)
+    check_depth_fits(depth, image)
     if Mode.GRAPH not in torch_mode():
         check_depth(depth)
+        if (said := check_image(image, encoded=color_space == "srgb")) is not None:
+            warn_once(None, "image in depth_blur", said)
+        _warn_of_unit(depth.detach(), f_number, focal_length, pixel_pitch)
     dtype = torch.promote_types(image.dtype, torch.float32)
     focus, aperture = (
         value.to(depth.device, dtype).reshape(-1, 1, 1, 1) if isinstance(value, Tensor) else value
@@ -149,6 +154,18 @@ def depth_blur(
     if color_space == "srgb":
         blurred = linear_to_srgb(blurred)
     return blurred.to(image.dtype)
+
+
+def _warn_of_unit(depth: Tensor, f_number: float | Tensor, focal_length: float, pixel_pitch: float) -> None:
+    """Warn once of depths that are as sharp as infinity, and that the default camera takes for millimetres."""
+    if not depth.numel():
+        return
+    usual, ends = ThinLensCamera(), torch.stack(torch.aminmax(depth)).float().cpu()
+    fastest = f_number.min().cpu() if isinstance(f_number, Tensor) else f_number
+    if blur_radius(ends[0], math.inf, fastest, focal_length, pixel_pitch) < _SHARP:
+        said = misread_depth(usual, *usual.defocus(ends.flip(0)))
+        if said is not None:
+            warn_once(None, "unit of depth in depth_blur", said, stacklevel=4)
 
 
 def _check_lens(
@@ -361,17 +378,7 @@ class RandomDepthBlur(DepthAugmentation):
         """Return blurred images. See :meth:`DepthAugmentation.change`."""
         if self.optics is not None:
             return self.optics(image, depth, field_center=params["field_center"])
-        if Mode.GRAPH not in torch_mode() and depth.numel() and depth.device.type != "meta":
-            _warn_of_unit(depth.detach())
         return depth_blur(image, depth, params["focus_distance"], params["f_number"], **self.flags)
-
-
-def _warn_of_unit(depth: Tensor) -> None:
-    """Warn once of depths that are probably not in metres, as the default camera does."""
-    usual, (nearest, farthest) = ThinLensCamera(), torch.aminmax(depth)
-    said = misread_depth(usual, *usual.defocus(torch.stack([farthest, nearest]).float().cpu()))
-    if said is not None:
-        warn_once(None, "unit of depth in RandomDepthBlur", said, stacklevel=2)
 
 
 _DISCS = {"focus_distance": (0.5, 5.0), "f_number": (2.0, 16.0), "focal_length": 50e-3, "max_radius": 16.0}
@@ -384,6 +391,6 @@ def _lens_camera(
     """Return a camera without masks and noise behind a real lens; refuse what discs alone have."""
     for (name, usual), value in zip(_DISCS.items(), given, strict=True):
         if value != usual:
-            raise ValueError(f"a real lens has a focus, an f-number and blur of its own: leave {name} out, got {value}")
+            raise ValueError(f"a real lens has its own focus, f-number and blur: leave {name} out, got {value}")
     settings = {"compositing": compositing, "color_space": color_space, "border": "replicate", "sensor": None}
     return TiDyOptics(NoMask(_CELLS), **lens_parts(lens, pixel_pitch), **settings)

@@ -48,5 +48,5 @@ def lens_optics(
         return make(lens)
     check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics()")
     if lens is not None:
-        raise ValueError("optics has a lens of its own: give lens to TiDyOptics, or leave optics out")
+        raise ValueError("optics has its own lens: give lens to TiDyOptics, or leave optics out")
     return optics

@@ -13,6 +13,8 @@ from kornia_tidy.augmentation.ranges import Range, check_probability, checked_ra
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.mode import Mode, torch_mode
+from kornia_tidy.optics.units import check_image, warn_once
 from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.sensor.steps import quantize, shot_noise
 
@@ -51,7 +53,7 @@ def sensor_noise(
 
     Raises:
         TypeError: if the image is not a floating-point tensor.
-        ValueError: if the image is not (B, C, H, W), or a quantity is negative.
+        ValueError: if the image is not (B, C, H, W), has NaN or sRGB values above 16, or a quantity is negative.
 
     Convention:
         - Gradients are those of :func:`~kornia_tidy.sensor.steps.shot_noise`, zero where a value is clipped.
@@ -65,6 +67,8 @@ def sensor_noise(
     """
     check_float_tensor("image", image, 4, "(B, C, H, W)")
     check_choice("color_space", color_space, COLOR_SPACES)
+    if Mode.GRAPH not in torch_mode() and (said := check_image(image, encoded=color_space == "srgb")) is not None:
+        warn_once(None, "image in sensor_noise", said)
     dtype = torch.promote_types(image.dtype, torch.float32)
     names = ("full_well", "read_noise", "dark")
     well, sigma, dark = (

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_part
 from kornia_tidy.sensor.sensor import SensorNoise
 
 
@@ -72,6 +73,7 @@ def burst(
         noise the sum over K is the averaged exposure times 1 - (K - 1) dead_time / exposure.
 
     Raises:
+        TypeError: if ``optics`` is no camera, or image or depth are no floating-point tensors.
         ValueError: if the burst has no time left to collect light, or image and depth do not fit.
 
     Convention:
@@ -90,6 +92,7 @@ def burst(
         >>> burst(optics, torch.rand(3, 80, 80), torch.ones(1, 80, 80), dead_time=10e-3).shape
         torch.Size([2, 3, 80, 80])
     """
+    check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics(PixelwiseMask(5))")
     sample = read_sample(image, depth, optics, field_center=field_center)
     shots, light = [], optics.psf_model.relative_light(sample.dtype)
     for k, share in enumerate(burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)):

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.samples import check_light, compute_dtype, read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.checks import check_float_tensor, check_part
 from kornia_tidy.modulator.modulator import Timeline
 
 
@@ -48,7 +48,7 @@ def moving_capture(
         (B, C, H, W) or (C, H, W), encoded as the images and of their type; smaller with ``border="valid"``.
 
     Raises:
-        TypeError: if images or depths are not floating-point tensors.
+        TypeError: if ``optics`` is no camera, or images or depths are not floating-point tensors.
         ValueError: if there is not one scene for each moment, or images and depths do not fit.
 
     Convention:
@@ -72,6 +72,7 @@ def moving_capture(
         >>> moving_capture(optics, *scenes_by_homography(image, depth, shift)).shape
         torch.Size([1, 3, 80, 80])
     """
+    check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics(PixelwiseMask(5))")
     batched = not isinstance(images, Tensor) or images.ndim != 4
     check_float_tensor("images", images, 5 if batched else 4, "(B, M, C, H, W) or (M, C, H, W)")
     check_float_tensor("depths", depths, images.ndim, "(B, M, 1, H, W) or (M, 1, H, W), as images are batched or not")

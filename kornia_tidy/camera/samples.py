@@ -19,7 +19,7 @@ from kornia_tidy.kernels.precision import widest
 from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
-from kornia_tidy.optics.units import SAME_FOCUS, check_image, layout_remedy, misread_depth, warn_once
+from kornia_tidy.optics.units import SAME_FOCUS, check_depth_fits, check_image, layout_remedy, misread_depth, warn_once
 from kornia_tidy.psf.field import check_centers
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
@@ -190,11 +190,7 @@ def read_sample(
         model.spectrum_of(image.shape[1], layout_remedy(given, channels))  # raises
     if 0 in image.shape[-2:]:
         raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
-    if depth.shape[1] != 1 or depth.shape[-2:] != image.shape[-2:] or depth.shape[0] not in (1, image.shape[0]):
-        raise ValueError(
-            f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got "
-            f"{tuple(depth.shape)}{layout_remedy(tuple(depth.shape), 1, 'depth') if depth.shape[1] != 1 else ''}"
-        )
+    check_depth_fits(depth, image)
     at_once = image.device.type == "cpu" or not deferred
     if camera.check_inputs and at_once and Mode.GRAPH not in torch_mode() and image.numel():
         lowest, highest = torch.aminmax(image.detach())

@@ -50,7 +50,7 @@ COMMANDS: Commands = {
 """Commands by name: module and class, or the commands of a group."""
 ABOUT = {
     "masks": "Turn masks into SLM frames or heights, and frames back into masks.",
-    "raw": "Camera raw files: what they hold, pictures of them, calibrations, reconstructions.",
+    "raw": "Camera raw files: contents, pictures, calibrations, reconstructions.",
 }
 """What the groups do."""
 

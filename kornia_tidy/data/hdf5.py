@@ -36,7 +36,7 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
             names = list(file)
             dataset = stored_numbers(file, names[0]) if len(names) == 1 else None
             if dataset is None:
-                raise ValueError(f"its HDF5 must hold one data set alone, found {', '.join(names)[:80] or 'none'}")
+                raise ValueError(f"its HDF5 must hold only one data set, found {', '.join(names)[:80] or 'none'}")
             check_pixels("the map", *_rows_and_columns(dataset.shape))
             return np.asarray(dataset[()])
     except DAMAGE as error:

@@ -74,7 +74,7 @@ class DesignTask(DesignSettings):
             raise ValueError(f"mask_size must be a whole number from 1 to {LARGEST_MASK}, got {self.mask_size}")
         timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
         if not 0 <= self.depth_weight <= 1:
-            raise ValueError(f"depth_weight must be from 0 (image alone) to 1 (depth alone), got {self.depth_weight}")
+            raise ValueError(f"depth_weight must be from 0 (only the image) to 1 (only depth), got {self.depth_weight}")
         if self.full_well is not None:
             check_positive("full_well", self.full_well)
         self.sensor(self.reference_f_number)  # refuses light and noise out of range

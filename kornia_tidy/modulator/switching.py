@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from kornia_tidy.checks import check_choice, check_number, check_positive
 from kornia_tidy.modulator.modulator import DwellTimes, Modulator, Timeline, timeline_of
 from kornia_tidy.optics.quadrature import gauss_legendre
+from kornia_tidy.optics.units import warn_once
 
 BETWEEN = ("random", "linear", "exponential")
 SLOWEST = 10.0  # s; even motors that exchange phase plates are faster
+LONG = 5.0  # s; longer exposures are probably milliseconds
 MOST_SAMPLES = 1024  # of a transition; a saved camera could ask for more than memory holds
 SETTLED = 0.99  # fraction of an exponential response that is complete at the end of the switching time
 
@@ -37,7 +39,7 @@ class Switching(Modulator):
 
     Args:
         switching_time: duration t of a transition in seconds.
-        exposure: duration T of the exposure in seconds.
+        exposure: duration T of the exposure in seconds. One above 5 s gets a warning: it may be in milliseconds.
         between: state within a transition, a name or the samples of a measured response.
         dwell: module that gives the dwell shares of the masks, such as :class:`DwellTimes`. Default: equal.
         cyclic: whether the exposure includes the transition from the last mask back to the first.
@@ -95,6 +97,9 @@ class Switching(Modulator):
                 f"{switching_time}"
             )
         check_positive("exposure", exposure, "seconds")
+        if exposure > LONG:
+            said = f"exposure is {exposure:g} s: if these are milliseconds, give {exposure / 1e3:g}"
+            warn_once(None, ("exposure", exposure), said)
         check_positive("samples", samples)
         if samples > MOST_SAMPLES:
             raise ValueError(f"samples must be at most {MOST_SAMPLES} points in time for a transition, got {samples}")

@@ -152,6 +152,25 @@ Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
     return None
 
 
+def check_depth_fits(depth: Tensor, image: Tensor) -> None:
+    """Raise ``ValueError`` unless a depth map, (B, 1, H, W) or (1, 1, H, W), has the image's size and batch.
+
+    Example:
+        >>> check_depth_fits(torch.ones(1, 1, 8, 9), torch.ones(1, 8, 9, 3))
+        Traceback (most recent call last):
+        ValueError: depth must have shape (1, 1, 9, 3) to fit the image, got (1, 1, 8, 9): put channels first with \
+image.permute(0, 3, 1, 2)
+    """
+    if depth.shape[1:] == (1, *image.shape[-2:]) and depth.shape[0] in (1, image.shape[0]):
+        return
+    wanted, remedy = (image.shape[0], 1, *image.shape[-2:]), ""
+    if depth.shape[1] != 1:
+        remedy = layout_remedy(tuple(depth.shape), 1, "depth")
+    elif depth.shape[-2:] == image.shape[1:3]:
+        remedy = layout_remedy(tuple(image.shape), 3)
+    raise ValueError(f"depth must have shape {wanted} to fit the image, got {tuple(depth.shape)}{remedy}")
+
+
 def layout_remedy(shape: tuple[int, ...], channels: int, name: str = "image") -> str:
     """Return the indexing or permutation that gives a tensor the expected channels, as the end of an error message.
 

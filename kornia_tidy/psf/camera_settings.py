@@ -27,7 +27,7 @@ _PAGE = 4096  # bytes; settings of about the same length fill the same tensor, a
 _MOST_VALUES = 1 << 16  # of a tensor written in full; of larger ones the digest is written
 _WORDS = ("name", "source")  # fields that name a setting and change nothing
 _NOT_SET = object()
-_REMEDY = f"without its {EXTRA_STATE!r} entry the state is loaded as weights alone"
+_REMEDY = f"without its {EXTRA_STATE!r} entry only the weights of the state are loaded"
 
 
 def settings_of(value: Any) -> Any:

@@ -18,6 +18,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import described
+from kornia_tidy.optics.units import warn_once
+
+ROUNDING, NO_DIFFERENCE = 1e-6, 0.05  # px; places between the two are no places of a picture, but may be metres
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,8 @@ class Field:
 def check_center(center: Any) -> tuple[float, float]:
     """Return where the middle of a picture lies, y and x in sensor pixels from the lens's axis, or raise an error.
 
+    A place within a twentieth of a pixel of the axis, and not on it, gets a warning: it may be in metres.
+
     Example:
         >>> check_center([3, 4])
         (3.0, 4.0)
@@ -128,6 +133,9 @@ def check_center(center: Any) -> tuple[float, float]:
         ) from None
     if not (math.isfinite(y) and math.isfinite(x)):
         raise ValueError(f"field_center must be finite, got {(y, x)}")
+    if ROUNDING < max(abs(y), abs(x)) < NO_DIFFERENCE:
+        said = f"field_center is in sensor pixels, and {(y, x)} is the axis: divide metres by the pixel pitch"
+        warn_once(None, "field_center", said, stacklevel=4)
     return y, x
 
 

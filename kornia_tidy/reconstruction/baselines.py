@@ -316,7 +316,7 @@ def _transformers(name: str, in_channels: int, out_channels: int, width: int) ->
     """Return the module transformers, once the arguments are checked."""
     if (in_channels, out_channels) != (3, 1):
         raise ValueError(
-            f"{name} takes 3 channels and estimates depth alone, 1 map, got {in_channels} and {out_channels}"
+            f"{name} takes 3 channels and estimates only depth, 1 map, got {in_channels} and {out_channels}"
         )
     if not isinstance(width, int) or width < 8 or width % 8 or (width > 64 and width % 64):
         raise ValueError(f"width must be a multiple of 8, above 64 of 64, got {width!r}")

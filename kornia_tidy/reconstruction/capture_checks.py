@@ -199,7 +199,7 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     Example:
         >>> light = 0.5 + 0.01 * torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0))
         >>> check_capture(light, MeasuredNoise(1e-6, 0.0)).notes
-        ('its noise is 0.01 of full scale, 10 times what is told: give noise=0.01',)
+        ('its noise is 0.01 of full scale, 10 times the stated noise: give noise=0.01',)
     """
     height, width = light.shape[-2:]
     top, left = max(0, (height - LARGEST) // 2), max(0, (width - LARGEST) // 2)
@@ -215,7 +215,9 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     found = noise.std(level)
     if told is not None and found > TWICE * told.std(level):
         factor = found / max(told.std(level), 1e-9)
-        notes.append(f"its noise is {found:.2g} of full scale, {factor:.0f} times what is told: give noise={found:.2g}")
+        notes.append(
+            f"its noise is {found:.2g} of full scale, {factor:.0f} times the stated noise: give noise={found:.2g}"
+        )
     blocks = blockiness(middle) > JPEG
     if blocks:
         notes.append(f"it shows the blocks of JPEG, taken for a noise of {JPEG_NOISE}: rather restore the raw file")

@@ -100,7 +100,7 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
     if not (parts := _refining(copied)):
         raise ValueError(
             f"orientations={orientations} is for a network that begins with the closed form, and "
-            f"{type(head).__name__} has none: a network that sees captures alone knows PSFs in one orientation"
+            f"{type(head).__name__} has none: a network without a closed form knows PSFs in one orientation"
         )
     for part in parts:
         assert part.network is not None

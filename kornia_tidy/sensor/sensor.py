@@ -20,6 +20,8 @@ from kornia_tidy.checks import (
     check_positive,
 )
 from kornia_tidy.kernels.sensor_ops import record
+from kornia_tidy.mode import Mode, torch_mode
+from kornia_tidy.optics.units import NONSENSE_CODE, check_image, warn_once
 from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
 from kornia_tidy.sensor.steps import check_bits
 
@@ -82,10 +84,12 @@ class Sensor(nn.Module):
 
         Raises:
             TypeError: if the image is not a floating-point tensor.
-            ValueError: if the image is not (B, C, H, W), a field is missing or has another shape, or both ``params``
-                and ``generator`` are given.
+            ValueError: if the image is not (B, C, H, W), a value is NaN or infinite, a field is missing or has another
+                shape, or both ``params`` and ``generator`` are given.
         """
         check_float_tensor("image", image, 4, "(B, C, H, W)")
+        if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
+            _check_light(image, getattr(self, "clip", False))
         light = image.to(torch.promote_types(image.dtype, torch.float32))
         if params is None:
             fields = self.draw(image.shape, image.device, generator, light.dtype)
@@ -133,6 +137,21 @@ class Sensor(nn.Module):
                     fields[name] = drawn.new_empty(*shape, device=device)
                 fields[name][..., top : top + STRIP, :] = drawn.to(device)
         return fields
+
+
+def _check_light(image: Tensor, clip: bool) -> None:
+    """Raise an error for values that are no light, and warn once of a picture that the full well turns white."""
+    mean = float(image.detach().mean()) if image.numel() else 0.0  # one pass, NaN if any value is
+    if 0 <= mean <= NONSENSE_CODE:
+        return
+    said = check_image(image, encoded=False)
+    if said is None and clip and mean > NONSENSE_CODE:
+        said = (
+            f"image holds {mean:.3g} times full scale on average and is recorded as white: divide 8-bit values by 255 "
+            f"and 16-bit ones by 65535"
+        )
+    if said is not None:
+        warn_once(None, "image on a sensor", said, stacklevel=5)
 
 
 def _field(params: Mapping[str, Tensor], name: str, light: Tensor) -> Tensor:
@@ -213,7 +232,9 @@ class SensorNoise(Sensor):
             if dark >= full_well:
                 raise ValueError(f"dark must be below full_well, {full_well} electrons, got {dark}")
         elif dark:
-            raise ValueError(f"dark needs full_well, the number of electrons at full scale, got dark = {dark} alone")
+            raise ValueError(
+                f"dark needs full_well, the number of electrons at full scale, got dark = {dark} without it"
+            )
         if bits is not None:
             check_bits(bits)
         self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip

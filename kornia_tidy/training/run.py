@@ -103,7 +103,7 @@ def train(
     goes_on = resume and (folder / LAST).exists()
     if settings.learn == "masks" and settings.head not in CLOSED_FORMS and head_from is None and not goes_on:
         raise ValueError(
-            f"learn='masks' learns through a network that stays as it is: begin with that of a trained system, "
+            f"learn='masks' learns through a network that does not change: begin with that of a trained system, "
             f"head_from, or take a head without weights, {' or '.join(CLOSED_FORMS)}"
         )
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")

@@ -175,7 +175,7 @@ class TestBoundDepth(BaseTester):
 
     def test_exception_another_size(self):
         optics, (image, depth) = augmentation(), scene(2)
-        with bound_depth(optics, depth[..., :-1]), pytest.raises(ValueError, match="to fit the image in RandomTiDy"):
+        with bound_depth(optics, depth[..., :-1]), pytest.raises(ValueError, match="to fit the image"):
             optics(image)
 
 

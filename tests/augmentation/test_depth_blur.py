@@ -116,6 +116,20 @@ class TestDepthBlur(BaseTester):
             depth_blur(image, depth, 1.0, 2.0, color_space="lab")
         with pytest.raises(TypeError, match="image must be floating point"):
             depth_blur(image.byte(), depth, 1.0, 2.0)
+        with pytest.raises(ValueError, match="image must be finite, got nan"):
+            depth_blur(image * torch.nan, depth, 1.0, 2.0)
+        with pytest.raises(ValueError, match=r"image must hold values from 0 to 1, got 2\d\d"):
+            depth_blur(255 * image, depth, 1.0, 2.0)
+        channels_last = image.movedim(1, -1)
+        with pytest.raises(ValueError, match=r"to fit the image, .*: put channels first with image.permute"):
+            depth_blur(channels_last, depth, 1.0, 2.0)
+
+    def test_feature_a_long_lens_sees_far_depths_apart_and_takes_them_for_metres(self, monkeypatch):
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        image, depth = torch.rand(1, 3, 8, 8), torch.linspace(300.0, 9000.0, 64).view(1, 1, 8, 8)
+        depth_blur(image, depth, 1000.0, 4.0, focal_length=0.5)  # warnings are errors
+        with pytest.warns(UserWarning, match="300 m away.*are these millimetres"):
+            depth_blur(image, depth, 1.0, 4.0)
 
     def test_smoke_discs_sum_to_one(self):
         for radius in (0, 0.5, 1.0, 3.3, 16.0):

@@ -243,5 +243,5 @@ class TestBehindALens(BaseTester):
         augmentation = RandomTiDyOptics(lens="double-gauss-50mm")
         assert augmentation.optics.lens.name == "double-gauss-50mm"
         assert augmentation.optics.camera.focal_length == augmentation.optics.lens.focal_length
-        with pytest.raises(ValueError, match="optics has a lens of its own: give lens to TiDyOptics"):
+        with pytest.raises(ValueError, match="optics has its own lens: give lens to TiDyOptics"):
             RandomTiDyOptics(TiDyOptics(), lens="double-gauss-50mm")

@@ -67,6 +67,10 @@ class TestSensorNoise(BaseTester):
             sensor_noise(image, torch.ones(3))
         with pytest.raises(TypeError, match="image must be floating point"):
             sensor_noise(image.byte(), 100.0)
+        with pytest.raises(ValueError, match="image must be finite, got nan"):
+            sensor_noise(image * torch.nan, 100.0)
+        with pytest.raises(ValueError, match=r"image must hold values from 0 to 1, got 2\d\d"):
+            sensor_noise(255 * image.clamp(min=0.9), 100.0)
 
 
 class TestRandomSensorNoise(BaseTester):

@@ -32,6 +32,8 @@ class TestBurst(BaseTester):
             burst_shares(torch.ones(3) / 3, dead_time=-1e-3, exposure=0.1)
         with pytest.raises(ValueError, match="switching takes the whole exposure"):
             burst(camera(modulator=Switching(50e-3)), *scene())
+        with pytest.raises(TypeError, match=r"optics must be a camera such as TiDyOptics.*, got the number 5"):
+            burst(5, *scene())
 
     def test_cardinality(self):
         image, depth = scene()

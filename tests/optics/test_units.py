@@ -31,6 +31,7 @@ from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.cli import main
 from kornia_tidy.data.depth_files import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
+from kornia_tidy.lab.mask_export import frame_times
 from kornia_tidy.masks import ZernikeMask
 from kornia_tidy.masks.initial_heights import initial_heights
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
@@ -335,6 +336,19 @@ class TestLens(BaseTester):
     def test_exception_switching_time_in_milliseconds(self):
         with pytest.raises(ValueError, match=r"switching_time must be .*seconds up to 10 .4 ms is 4e-3., got 20"):
             Switching(20, exposure=100)
+
+    def test_feature_an_exposure_in_milliseconds_is_told(self, monkeypatch):
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        frame_times((1, 1), 1.0)  # warnings are errors
+        with pytest.warns(UserWarning, match=r"exposure is 100 s: if these are milliseconds, give 0.1"):
+            frame_times((1, 1), 100, 8e-3)
+
+    def test_feature_a_place_in_the_field_in_metres_is_told(self, monkeypatch):
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        for center in ((0.0, 0.0), (1e-9, 0.0), (0.0, -0.3)):
+            camera(field_center=center)  # warnings are errors
+        with pytest.warns(UserWarning, match=r"in sensor pixels, and \(0.0, -0.003\) is the axis: divide metres by"):
+            camera(field_center=(0.0, -3e-3))
 
 
 class TestTypes(BaseTester):

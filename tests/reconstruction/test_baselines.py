@@ -146,7 +146,7 @@ class TestByName(BaseTester):
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
-            ({"out_channels": 3}, "takes 3 channels and estimates depth alone, 1 map, got 3 and 3"),
+            ({"out_channels": 3}, "takes 3 channels and estimates only depth, 1 map, got 3 and 3"),
             ({"out_channels": 1, "in_channels": 8}, "got 8 and 1"),
             ({"out_channels": 1, "width": 100}, "width must be a multiple of 8, above 64 of 64, got 100"),
         ],

@@ -263,6 +263,7 @@ class TestSensorNoise(BaseTester):
         )
     )
     @settings(max_examples=50)
+    @pytest.mark.filterwarnings("ignore:image holds:UserWarning")
     def test_property_without_noise_it_is_a_clamp(self, array):
         assert np.array_equal(SensorNoise(0.0)(torch.from_numpy(array)).numpy(), np.clip(array, 0, 1))
 

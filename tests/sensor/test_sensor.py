@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import TiDyOptics
+from kornia_tidy import SensorNoise, TiDyOptics
 from kornia_tidy.sensor import Sensor
 from tests.base import BaseTester
 
@@ -38,3 +38,20 @@ class TestSensor(BaseTester):
     def test_exception_nothing_is_recorded_by_the_base(self):
         with pytest.raises(NotImplementedError):
             Sensor()(torch.ones(1, 1, 4, 4))
+
+    @pytest.mark.parametrize("sensor", [Film(), SensorNoise(0.01)], ids=["own", "noise"])
+    @pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+    def test_exception_light_that_is_no_number(self, sensor, bad, device, dtype):
+        light = torch.ones(2, 3, 4, 4, device=device, dtype=dtype)
+        light[1, 2, 3, 0] = bad
+        with pytest.raises(ValueError, match=f"image must be finite, got {bad}"):
+            sensor(light)
+
+    def test_feature_eight_bit_values_are_told_once_and_light_is_not(self, monkeypatch):
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        light = torch.rand(1, 3, 8, 8)
+        light[0, 0, 0] = 100.0  # a lamp; warnings are errors
+        SensorNoise(0.01)(light)
+        SensorNoise(0.01, clip=False)(1000 * light)
+        with pytest.warns(UserWarning, match="times full scale on average .*: divide 8-bit values by 255"):
+            SensorNoise(0.01)(255 * torch.rand(1, 3, 8, 8))

@@ -100,7 +100,7 @@ class Guard:
         if len(origins) > 1 or (origins and not self._is_own(origins[0], host["port"])):
             return 403, "requests of other sites are refused"
         if any(site not in {"same-origin", "none"} for site in headers.get("sec-fetch-site", [])):
-            return 403, "requests of other sites are refused: open the address in a tab of its own"
+            return 403, "requests of other sites are refused: open the address in its own tab"
         if path.startswith(ELSEWHERE):
             return 403, "this page asks nothing of other servers"
         file = FILES.match(path)

@@ -236,7 +236,7 @@ for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens 
             refuse_with_psfs(given)
         if self.head is not None and self.head not in CLOSED_FORMS:
             raise ValueError(
-                f"{self.head} has a camera of its own: leave out {option}, or take one of "
+                f"{self.head} has its own camera: leave out {option}, or take one of "
                 f"{', '.join(map(repr, CLOSED_FORMS))} as --head"
             )
         if self.masks is None:

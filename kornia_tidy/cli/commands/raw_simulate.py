@@ -190,7 +190,7 @@ The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
         if self.sensor.like is not None:
             for name in ("pattern", "bits", "black"):
                 if getattr(self.sensor, name) is not None:
-                    raise ValueError(f"--like has a sensor of its own: leave out --{name}")
+                    raise ValueError(f"--like has its own sensor: leave out --{name}")
             return RawCapture.open(self.sensor.like, white=self.sensor.white)
         if self.sensor.white is not None:
             raise ValueError("--white is of the file of --like: give that, or --bits")

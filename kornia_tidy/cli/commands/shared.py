@@ -251,7 +251,7 @@ def masks_of(masks: int | str, seed: int = 0) -> PixelwiseMask:
 def refuse_with_psfs(given: Iterable[str]) -> None:
     """Raise ``ValueError`` if an option was given for what ``--psfs`` says: lens, masks and distances."""
     for name in given:
-        raise ValueError(f"--psfs has a lens, masks and distances of its own: leave out --{name.replace('_', '-')}")
+        raise ValueError(f"--psfs has its own lens, masks and distances: leave out --{name.replace('_', '-')}")
 
 
 def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTransfer | None]:

@@ -111,7 +111,7 @@ def _rows(path: str | os.PathLike[str]) -> tuple[list[_Row], list[_Row]]:
         elif not found and whole.strip():
             header.append(_Row(line, _plain(whole[:LONGEST])))
     if not found:
-        raise ValueError(f"cannot read {path}: {_FORM}, as text, and no line has numbers alone")
+        raise ValueError(f"cannot read {path}: {_FORM}, as text, and no line has only numbers")
     try:
         separator, decimal = _punctuation([row.text for row in found], header)
     except ValueError as error:

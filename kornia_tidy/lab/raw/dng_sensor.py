@@ -253,7 +253,7 @@ def _black(
     deltas = source.long_values(data, BLACK_COLUMNS), source.long_values(data, BLACK_ROWS)
     for name, values in zip(("BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"), (levels, *deltas), strict=True):
         if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-            raise ValueError(f"its {name} holds what is no finite number")
+            raise ValueError(f"its {name} holds a value that is not a finite number")
     pixels = [tuple(levels[i : i + samples]) for i in range(0, len(levels), samples)]
     return [pixels[i : i + columns] for i in range(0, len(pixels), columns)], *deltas
 
@@ -266,7 +266,7 @@ def _white(directory: Directory, samples: int, default: float) -> tuple[float, .
     if len(levels) != samples:
         raise ValueError(f"its WhiteLevel has {len(levels)} values for {samples} samples a pixel")
     if not all(isinstance(level, int | float) and 0 <= level < math.inf for level in levels):
-        raise ValueError("its WhiteLevel holds what is no positive number")
+        raise ValueError("its WhiteLevel holds a value that is not a positive number")
     return tuple(level or default for level in levels)
 
 

@@ -139,7 +139,7 @@ class _Reader:
         if label in ("AIR", ""):
             return AIR
         if label == "REFL":
-            raise ValueError(f"{where} is a mirror, and lenses of refracting surfaces alone are read")
+            raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
         indices = self.lens.indices
         if label not in indices:
             if _FICTITIOUS.fullmatch(label):

@@ -76,7 +76,7 @@ def _optiland_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
         surface.powers = {step * (j + 1): number(f"coefficients of {where}", term) for j, term in enumerate(terms)}
     acts = row.get("interaction_model") or {}
     if not isinstance(acts, Mapping) or acts.get("is_reflective") or row.get("is_reflective"):
-        raise ValueError(f"{where} is a mirror, and lenses of refracting surfaces alone are read")
+        raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
     if (acted := acts.get("type", "RefractiveReflectiveModel")) != "RefractiveReflectiveModel":
         raise ValueError(f"{where} must refract, got {acted!r:.60}")
     edge = row.get("aperture")
@@ -102,7 +102,7 @@ def _optiland_glass(where: str, given: Mapping[str, Any], indices: dict[str, Any
         maker = given.get("reference") or given.get("catalog")
         return _named(where, given["name"], indices, [maker] if isinstance(maker, str) else ())
     if kind == "Mirror":
-        raise ValueError(f"{where} is a mirror, and lenses of refracting surfaces alone are read")
+        raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
     raise ValueError(f"the glass of {where} must be Material, AbbeMaterial or IdealMaterial, got {kind!r:.60}")
 
 

@@ -158,7 +158,7 @@ def _glass(where: str, words: Sequence[str], indices: dict[str, Any], catalogues
     if name.upper() == "AIR":
         return AIR
     if name.upper() == _MIRROR:
-        raise ValueError(f"{where} is a mirror, and lenses of refracting surfaces alone are read")
+        raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
     if len(words) > 4 and words[1] == _MODEL:
         nd, vd = number(f"index of {where}", words[3]), number(f"Abbe number of {where}", words[4])
         name = f"{nd:g}/{vd:g}"

@@ -287,7 +287,9 @@ def _told() -> Generator[None]:
     except (FileExistsError, FileNotFoundError):
         raise
     except OSError as error:
-        raise OSError(f"{error}; what was written before is intact, and the same call goes on from there") from error
+        raise OSError(
+            f"{error}; files that were written before are intact, and the same call goes on from there"
+        ) from error
 
 
 @contextmanager

@@ -110,7 +110,7 @@ class TestPsf(BaseTester):
             (["--lens", "single-5mm"], "--lens must be one of 'double-gauss-50mm', 'triplet-50mm'"),
             (["--lens", "a.lens", "--f-number", "8"], "the lens a.lens has its own: leave out --f-number"),
             (["tidy-5", "--field", "3", "--fidelity", "draft"], "--field is for a camera with a lens, and tidy-5 has"),
-            (["camera.safetensors", "--lens", "single-50mm"], "camera.safetensors has a lens of its own"),
+            (["camera.safetensors", "--lens", "single-50mm"], "camera.safetensors has its own lens"),
             (["--lens", "single-50mm", "--field", "0"], "--field must be a whole number of at least 1, got 0"),
             (["--lens", "single-50mm", "--fidelity", "paper"], "fidelity 'paper' means an ideal lens"),
         ],
@@ -133,7 +133,7 @@ class TestPsf(BaseTester):
             (["tidy-9"], "must be one of 'tidy-5', 'tidy-1'"),
             (["tidy-5", "--depths", "nan"], "--depths must be positive metres, got 'nan'"),
             (["tidy-5", "--window", "20"], "window must be an odd number of pixels, got 20"),
-            (["tidy-5", "--focus-distance", "2"], "has a lens of its own"),
+            (["tidy-5", "--focus-distance", "2"], "has its own lens"),
             (["tidy-5", "-o", "a.txt"], "suffix of an image file"),
         ],
     )

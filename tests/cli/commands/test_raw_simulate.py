@@ -127,9 +127,9 @@ class TestThereAndBack(BaseTester):
             (["--masks", "1", "--lens", "lens"], "--lens must be one of 'double-gauss-50mm'"),
             (["--masks", "gone.npy"], "gone.npy"),
             (["--masks", "1", "--lens", "single-50mm", "--focal-length", "0.04"], "leave out --focal-length"),
-            (["--lens", "single-50mm", "--head", "edof-5"], "edof-5 has a camera of its own: leave out --lens"),
-            (["--masks", "1", "--head", "camera.safetensors"], "camera.safetensors has a camera of its own"),
-            (["--masks", "1", "--psfs", "bank.safetensors"], "--psfs has a lens, masks and distances of its own"),
+            (["--lens", "single-50mm", "--head", "edof-5"], "edof-5 has its own camera: leave out --lens"),
+            (["--masks", "1", "--head", "camera.safetensors"], "camera.safetensors has its own camera"),
+            (["--masks", "1", "--psfs", "bank.safetensors"], "--psfs has its own lens, masks and distances"),
             (["--masks", "1"], "the noise of image.png is not known: give --noise"),
         ],
     )
