@@ -155,11 +155,11 @@ class Psf:
         saved = None if name is None or name in SYSTEMS or suffix == ".npy" else load_camera(name)
         if saved is not None and self.lens is not None:
             raise ValueError(
-                f"{name} has its own lens: --lens is only for published systems and files that hold masks without a lens"
+                f"{name} has its own lens: --lens is only for published systems and files of masks without a lens"
             )
         if (saved is not None or (name in SYSTEMS and self.lens is None)) and self.settings != LensSettings():
             raise ValueError(
-                f"{name} has its own lens: --focal-length and the like are only for files that hold masks without a lens"
+                f"{name} has its own lens: --focal-length and the like are only for files of masks without a lens"
             )
         camera, lens = camera_and_lens(self.lens, self.settings)
         if name is None:
