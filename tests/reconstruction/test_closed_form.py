@@ -206,16 +206,6 @@ class TestClosedForm(BaseTester):
         exact = restore(capture.bfloat16().float()).image
         assert (found.float() - exact).abs().max() <= 2**-9  # half a unit in the last place below 1
 
-    @pytest.mark.parametrize("inverse", ["tikhonov", "wiener"])
-    def test_gradcheck(self, inverse, device):
-        restore = closed_form(inverse=inverse).to(device)
-
-        def restored(capture):
-            found = restore(capture, 0.01)
-            return found.maps, found.image
-
-        self.gradcheck(restored, (photo(8, 8)[:1].to(device),))
-
     @pytest.mark.takes_seconds
     def test_dynamo(self, device):
         """Traced, kernels are applied by strided convolutions."""

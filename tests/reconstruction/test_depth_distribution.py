@@ -47,12 +47,6 @@ class TestDepthMoments(BaseTester):
     def test_gradcheck(self, device):
         self.gradcheck(depth_moments, (torch.rand(1, 4, 2, 2, device=device),))
 
-    def test_dynamo(self, device):
-        logits = torch.rand(1, 4, 2, 3, device=device)
-        compiled = torch.compile(depth_moments, fullgraph=True, backend="eager")
-        for part, expected in zip(compiled(logits), depth_moments(logits), strict=True):
-            self.assert_close(part, expected, atol=0, rtol=0)
-
     def test_exception(self):
         with pytest.raises(ValueError, match=r"needs 2 classes or more, got logits \(1, 1, 2, 2\)"):
             depth_moments(torch.rand(1, 1, 2, 2))

@@ -59,8 +59,3 @@ class TestSmoothedClasses(BaseTester):
     def test_gradcheck(self):
         logits, guide = maps(12, 16, classes=2)
         self.gradcheck(smoothed_classes, (logits[:1].requires_grad_(), (0.2 + 0.5 * guide[:1]).requires_grad_()))
-
-    def test_dynamo(self):
-        logits, guide = maps(16, 32, dtype=torch.float32)
-        compiled = torch.compile(smoothed_classes, fullgraph=True, backend="eager")
-        self.assert_close(compiled(logits, guide), smoothed_classes(logits, guide))

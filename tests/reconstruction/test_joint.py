@@ -5,21 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.reconstruction import AttentionUNet, JointHead, MiDaSSmall, PhaseCam3DUNet
+from kornia_tidy.reconstruction import AttentionUNet, JointHead
 from tests.base import BaseTester
 from tests.reconstruction.test_head import SeeingHead
 
 
 class TestJointHead(BaseTester):
-    @pytest.mark.parametrize("make", [AttentionUNet, PhaseCam3DUNet, MiDaSSmall])
-    def test_smoke_any_head_can_be_joint(self, make, device):
-        small = {} if make is MiDaSSmall else {"width": 2}
-        head = JointHead(make(out_channels=4, **small)).to(device).eval()
-        with torch.no_grad():
-            estimate = head(torch.rand(2, 3, 21, 40, device=device))
-        assert estimate.depth.shape == (2, 1, 21, 40)
-        assert estimate.image.shape == (2, 3, 21, 40)
-
     def test_convention_depth_is_the_first_channel(self, device, dtype):
         maps = torch.rand(2, 4, 8, 8, device=device, dtype=dtype)
         depth, image = JointHead(SeeingHead(4, 4))(maps)

@@ -147,33 +147,6 @@ class TestLayeredJointHead(BaseTester):
         head(torch.rand(1, 3, 20, 20))[:, :CLASSES].square().sum().backward()
         assert head.depth_network.layers[-1].weight.grad.any()
 
-    def test_feature_gradients_reach_what_the_filters_come_from(self):
-        psfs = box_bank().psfs.requires_grad_()
-        head = layered()
-        head.set_psfs(PSFBank.from_measured(psfs, torch.arange(float(LAYERS))))
-        head(torch.rand(1, 3, 20, 20))[:, -3:].square().sum().backward()
-        assert psfs.grad.abs().max() > 0
-
-    def test_feature_correlated_captures_have_flipped_psfs(self):
-        psfs = make_psfs(LAYERS, 3, 5, dtype=torch.float32)
-        flipped = PSFBank.from_measured(psfs.flip((-2, -1)), torch.arange(float(LAYERS)))
-        head, other = layered(), layered()
-        head.set_psfs(PSFBank.from_measured(psfs, torch.arange(float(LAYERS))), correlate=True)
-        other.set_psfs(flipped)
-        self.assert_close(head.filters, other.filters)
-        self.assert_close(head.whitening, other.whitening)
-
-    def test_feature_temperature_widens_the_distribution_and_leaves_the_image(self):
-        head, capture = layered(), torch.rand(1, 3, 20, 24)
-        with torch.no_grad():
-            before = head(capture)
-            head.temperature.fill_(2.0)
-            after = head(capture)
-            trained = head.train()(capture)
-        self.assert_close(after[:, :CLASSES], before[:, :CLASSES] / 2)
-        assert torch.equal(after[:, CLASSES:], before[:, CLASSES:])
-        assert torch.equal(trained, before)
-
     def test_feature_tiles_are_the_whole(self):
         head = JointHead(stirred(width=2)).eval()
         assert receptive_field(head) == 10 + 8 + 31 + 31  # of filters, patches and both networks

@@ -40,14 +40,6 @@ class TestWienerKernels(BaseTester):
     def test_feature_depths_count_by_the_statistics(self):
         self.assert_close(wiener_kernels(blurs(2), (0.01,), FAR), wiener_kernels(blurs(2)[:1], (0.01,), FAR))
 
-    def test_feature_depths_that_differ_are_amplified_less(self):
-        """A kernel for PSFs that differ passes less noise than one for their mean alone."""
-        psfs = blurs()
-        many = wiener_kernels(psfs, (0.005,), EVEN)
-        shares = torch.tensor([0.25, 0.5, 0.25], dtype=torch.float64).view(-1, 1, 1, 1)
-        alone = wiener_kernels((shares * psfs).sum(0, keepdim=True), (0.005,), EVEN)
-        assert (many.square().sum((-2, -1)) < 0.9 * alone.square().sum((-2, -1))).all()
-
     def test_feature_white_becomes_white(self):
         """A window that holds 80 % of the light makes white 0.8."""
         expected = torch.full((2, 2), 1 / 0.8, dtype=torch.float64)
