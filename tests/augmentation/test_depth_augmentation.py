@@ -6,12 +6,20 @@ import pickle
 import kornia.augmentation as K
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from kornia_tidy.augmentation import RandomTiDyOptics, bound_depth
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
-from tests.camera.test_pipelines_kornia import crops
+
+
+def crops(geometry: K.AugmentationSequential, tensor: Tensor) -> Tensor:
+    """Flip and crop by slicing, at the corners that kornia drew."""
+    corners = geometry._params[1].data["src"][:, 0].long().tolist()
+    flipped = tensor.flip(-1)
+    return torch.stack(
+        [x[:, top : top + 32, left : left + 36] for x, (left, top) in zip(flipped, corners, strict=True)]
+    )
 
 
 def augmentation(**options: object) -> RandomTiDyOptics:

@@ -16,8 +16,6 @@ from torch.optim.swa_utils import AveragedModel
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.masks import CubicMask, RadialMask
-from kornia_tidy.modulator.modulator import LearnableDwellTimes, SpatialLightModulator
-from kornia_tidy.modulator.phase_panel import GreyLevels
 from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics import FUSED_SILICA, SYSTEMS
 from kornia_tidy.optics.aperture import circular_aperture
@@ -173,30 +171,6 @@ class TestTheSameCamera(BaseTester):
             fresh.load_state_dict(stored(average.state_dict(), "torch"))
             camera, other = (next(m for m in x.modules() if isinstance(m, TiDyOptics)) for x in (average, fresh))
             assert torch.equal(capture(camera), capture(other))
-
-    def test_feature_all_kinds_of_parts(self):
-        def make():
-            return TiDyOptics(
-                RadialMask(2, material=FUSED_SILICA, constraint="sigmoid", generator=torch.Generator().manual_seed(0)),
-                ThinLensCamera(focus_distance=torch.tensor(0.595), lens_material=FUSED_SILICA, depth_range=(0.5, 5.0)),
-                SpatialLightModulator(
-                    GreyLevels(5), Switching(4e-3, dwell=LearnableDwellTimes((1, 2))), fill_factor=0.9
-                ),
-                SensorNoise.physical(10000, 2.4),
-                Fidelity.preset("draft").replace(wavelengths=2),
-                "scatter",
-                "linear",
-                "zero",
-                Spectrum((450e-9, 530e-9, 620e-9, 640e-9), ((0, 0, 1, 1), (0, 1, 0, 0), (1, 0, 0, 0))),
-                circular_aperture(46, 0.05),
-            )
-
-        optics, other = trained(make()), make()
-        with torch.no_grad():
-            optics.camera.focus_distance.fill_(0.7)
-        other.load_state_dict(stored(optics.state_dict(), "safetensors"))
-        optics.check_inputs = other.check_inputs = False
-        assert torch.equal(capture(other), capture(optics))
 
 
 OTHERS = [

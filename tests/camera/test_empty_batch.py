@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import pytest
 import torch
-from torch import Tensor
 
 from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, TiDyOptics, burst, moving_capture
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 from tests.base import BaseTester
-
-
-class Sample(NamedTuple):
-    image: Tensor
-    depth: Tensor
-    label: str
 
 
 def camera(**options) -> TiDyOptics:
@@ -40,20 +31,6 @@ class TestEmptyBatch(BaseTester):
         assert coded.dtype == dtype
         assert optics.clamped_pixels == 0
         assert torch.equal(torch.get_rng_state(), state)
-
-    def test_feature_every_form_of_a_sample(self):
-        optics, (image, depth) = camera(border="valid"), scenes()
-        for sample in ((image, depth, "a"), [image, depth, "a"], Sample(image, depth, "a")):
-            coded, there, label = optics(sample)
-            assert type(optics(sample)) is type(sample)
-            assert (coded.shape, there.shape, label) == ((0, 3, 16, 24), (0, 1, 16, 24), "a")
-        mapping = optics({"image": image, "depth": depth, "mask": depth > 0})
-        assert {name: tuple(value.shape) for name, value in mapping.items()} == {
-            "image": (0, 3, 16, 24), "all_in_focus": (0, 3, 16, 24), "depth": (0, 1, 16, 24), "mask": (0, 1, 16, 24),
-        }  # fmt: skip
-        assert optics(image, torch.ones(1, 1, 24, 32)).shape == (0, 3, 16, 24)
-        assert optics.as_transform()({"image": image, "depth": depth})["image"].shape == (0, 3, 16, 24)
-        assert optics(image, depth, params=optics.draw(image)).shape == (0, 3, 16, 24)
 
     def test_feature_gradients_are_zero(self):
         optics, (image, depth) = camera(), scenes()

@@ -130,18 +130,6 @@ class TestAsTransform(BaseTester):
         error = image_tensor(coded) - self.expected(optics)
         assert error.abs().max() <= 0.5001 / 255  # rounded once
 
-    def test_feature_float_tensors_under_other_names(self):
-        optics, (image, depth) = camera(sensor=None), (x[0] for x in scene(1))
-        out = optics.as_transform(image_key="image", depth_key="z")({"image": image, "z": depth})
-        self.assert_close(out["image"], optics(image, depth))
-
-    def test_feature_a_seed_repeats_items_of_arrays(self):
-        image, depth = self.stored()
-        transform = camera().as_transform(seed=3, depth_scale=0.001)
-        one, same, other = (transform({"image": image, "depth": depth, "index": n})["image"] for n in (1, 1, 2))
-        assert np.array_equal(one, same)
-        assert not np.array_equal(one, other)
-
     def test_feature_the_border_valid_crops_all_of_them(self):
         image, depth = self.stored()
         out = camera(border="valid").as_transform(depth_scale=0.001)(

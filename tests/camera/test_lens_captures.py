@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -357,16 +356,6 @@ class TestLensCaptures(BaseTester):
         model = camera(fidelity=SETTINGS.replace(field_tolerance=1e-7)).psf_model
         with pytest.warns(UserWarning, match=r"vary so much over 1110x1282 px that 13 places along a side leave a rel"):
             assert max(model.field_of((1110, 1282)).nodes) == 13
-
-    @torch.no_grad()
-    def test_feature_threads_with_pictures_of_other_sizes(self):
-        optics, scenes = camera(center=(450.0, 520.0)), [scene(24, 24 + 2 * i, seed=i) for i in range(3)]
-        alone = [camera(center=(450.0, 520.0))(*each) for each in scenes]
-        with ThreadPoolExecutor(4) as pool:
-            take = torch.no_grad()(lambda each: optics(*each))  # a thread records gradients unless it is told
-            together = list(pool.map(take, scenes * 2))
-        for i, capture in enumerate(together):
-            self.assert_close(capture, alone[i % 3], rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize(
         ("center", "error", "message"),

@@ -9,7 +9,6 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from kornia_tidy import (
-    DefocusRange,
     DwellTimes,
     Fidelity,
     LearnableDwellTimes,
@@ -110,27 +109,6 @@ class TestMovingCapture(BaseTester):
         assert float(apart["veil"]) < 1e-12
         assert 1e-5 < float(apart["renormalize"]) < 0.05
 
-    @pytest.mark.parametrize("stray_light", ["discard", "renormalize"])
-    def test_feature_a_moving_scene_is_the_sum_of_shifted_captures_through_single_masks(self, stray_light):
-        """Far from the border, moved by whole pixels: each mask's own camera takes it at rest, moved after by roll."""
-        optics = camera(modulator=DwellTimes((1, 2, 1)), fidelity=SMALL.replace(stray_light=stray_light, double=True))
-        image = torch.zeros(1, 3, 48, 48, dtype=torch.float64)
-        image[..., 16:30, 16:30] = torch.rand(1, 3, 14, 14)
-        depth = torch.full((1, 1, 48, 48), 0.45, dtype=torch.float64)
-        moves = [(-3, 1), (0, 0), (4, -2)]
-        expected = 0
-        for k, ((right, down), share) in enumerate(zip(moves, (0.25, 0.5, 0.25), strict=True)):
-            alone = camera(1, fidelity=optics.fidelity)
-            alone.masks.phase.data = optics.masks.phase.detach()[k : k + 1]
-            alone.fidelity = alone.fidelity.replace(window=optics.window)
-            with torch.no_grad():
-                expected = expected + share * alone(image, depth).roll((down, right), (-2, -1))
-        with torch.no_grad():
-            moving = moving_capture(optics, *scenes_by_homography(image, depth, shifts(moves)))
-            self.assert_close(moving, expected, rtol=0, atol=1e-12)
-            still = optics(image, depth)
-        assert float((moving - still).abs().max()) > 1e-2
-
     def test_feature_gradients_reach_masks_dwell_times_and_scenes(self):
         optics = camera(3, LearnableDwellTimes((1, 1, 1)))
         images, depths = at_rest(optics, *scene(torch.float32))
@@ -139,14 +117,6 @@ class TestMovingCapture(BaseTester):
         assert bool((optics.masks.phase.grad.abs().amax((1, 2)) > 0).all())
         assert float(optics.modulator.logits.grad.abs().max()) > 0
         assert bool((images.grad.abs().amax((0, 2, 3, 4)) > 0).all())
-
-    def test_feature_the_camera_stays_as_it_is(self):
-        optics, (image, depth) = camera(sensor=SensorNoise(0.01)), scene(torch.float32)
-        before = optics(image, depth, generator=torch.Generator().manual_seed(0))
-        moving_capture(optics, *at_rest(optics, image, depth))
-        assert torch.equal(before, optics(image, depth, generator=torch.Generator().manual_seed(0)))
-        assert optics.color_space == "linear"
-        assert optics.sensor is not None
 
     def test_feature_depths_out_of_range_are_warned_about_once(self):
         optics, (image, depth) = camera(), scene()
@@ -180,12 +150,6 @@ class TestThroughState(BaseTester):
             self.assert_close(one.through_state(0).psf_bank().psfs, one.psf_bank().psfs)
             assert one.state_weights(torch.float32).tolist() == [1.0]
             assert one.window == optics.window
-
-    def test_feature_the_weighted_mean_of_the_states_is_the_bank(self):
-        for fidelity in (SMALL, Fidelity.preset("paper")):
-            optics = TiDyOptics(PixelwiseMask(3), DefocusRange(-10, 10), DwellTimes((1, 2, 5)), fidelity=fidelity)
-            mean = sum(w / 8 * optics.through_state(k).psf_bank().psfs for k, w in enumerate((1, 2, 5)))
-            self.assert_close(mean, optics.psf_bank().psfs, rtol=1e-5, atol=1e-8)
 
     def test_feature_remembered_states_follow_the_masks_and_send_gradients_to_their_own(self):
         optics = camera()
@@ -285,13 +249,6 @@ class TestScenes(BaseTester):
             strict=True,
         ):
             self.assert_close(a, b, rtol=0, atol=1e-12)
-
-    def test_feature_whole_pixels_move_exactly_and_the_border_goes_on(self):
-        image, depth = scene()
-        images, depths = scenes_by_homography(image, depth, shifts([(2, 0), (0, -3)]))
-        self.assert_close(images[:, 0, :, :, 2:], image[..., :-2], rtol=0, atol=1e-12)
-        self.assert_close(images[:, 0, :, :, :2], image[..., :1].expand(-1, -1, -1, 2), rtol=0, atol=1e-12)
-        assert torch.equal(depths[:, 1, :, :-3], depth[..., 3:, :])
 
     def test_feature_no_depth_appears_that_is_not_in_the_scene_and_infinity_stays(self):
         image, depth = scene()

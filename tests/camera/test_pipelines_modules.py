@@ -21,14 +21,6 @@ class TestCopies(BaseTester):
         optics.zero_grad(set_to_none=True)
         assert len(pickle.dumps(optics)) < fresh + 8_000  # the aperture, 23x23 float64, is made on the first call
 
-    def test_feature_a_copy_is_independent(self):
-        optics, (image, depth) = camera(sensor=None), scene()
-        before, twin = optics(image, depth), copy.deepcopy(optics)
-        with torch.no_grad():
-            twin.masks.phase.zero_()
-        assert torch.equal(optics(image, depth), before)
-        assert not torch.equal(twin(image, depth), before)
-
 
 def units_in_last_place(a: Tensor, b: Tensor) -> int:
     """Largest distance between positive numbers of half precision, counted in representable numbers."""
@@ -85,14 +77,6 @@ class TestPrecision(BaseTester):
         assert coded.dtype == kind
         assert torch.equal(coded, optics(image, depth, params=params))
 
-    def test_feature_autocast_does_not_touch_gradients(self):
-        optics, (image, depth) = camera(sensor=None), scene()
-        (plain,) = torch.autograd.grad(optics(image, depth).mean(), optics.masks.phase)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            loss = optics(image, depth).mean()
-        (cast,) = torch.autograd.grad(loss, optics.masks.phase)
-        assert torch.equal(cast, plain)
-
 
 # Inductor imports what torch has deprecated, and leaves complex numbers to eager kernels.
 @pytest.mark.filterwarnings("ignore:Torchinductor does not support code generation for complex:UserWarning")
@@ -111,15 +95,6 @@ class TestCompile(BaseTester):
 
 
 class TestParts(BaseTester):
-    def test_feature_new_masks_are_measured_anew(self):
-        optics = TiDyOptics(sensor=None)
-        masks = PixelwiseMask(3, size=21, initial="flat")
-        wide, optics.masks = optics.window, masks
-        fresh = TiDyOptics(masks=masks, sensor=None)
-        assert optics.window == fresh.window < wide
-        image, depth = scene(1, height=80, width=80)
-        assert torch.equal(optics(image, depth), fresh(image, depth))
-
     def test_feature_a_new_camera_is_measured_anew(self):
         optics = TiDyOptics(masks=PixelwiseMask(1, initial="flat"))
         fine = optics.window
@@ -131,13 +106,6 @@ class TestParts(BaseTester):
         assert optics.defocus_nodes[0] == pytest.approx(
             11.911 * (1 / 0.61 - 1 / 0.595), rel=1e-3
         )  # pi R^2 / 530 nm = 11.911 m
-
-    def test_feature_sensor_none_is_noise_free(self):
-        optics, (image, depth) = camera(), scene()
-        assert not torch.equal(optics(image, depth), optics(image, depth))
-        optics.sensor = None
-        assert torch.equal(optics(image, depth), optics(image, depth))
-        assert optics.draw(image) == {}
 
 
 class TestOptimiser(BaseTester):

@@ -9,15 +9,12 @@ import pytest
 import torch
 
 from kornia_tidy import DefocusRange, Fidelity, NoMask, PixelwiseMask, TiDyOptics
-from kornia_tidy.camera.published_systems import cubic_in_zernikes, single_element
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.camera.published_systems import single_element
 from kornia_tidy.design.fisher_information import crlb
-from kornia_tidy.masks import CubicMask, RadialMask, ZernikeMask
+from kornia_tidy.masks import RadialMask
 from kornia_tidy.optics import SYSTEMS, published_system
 from kornia_tidy.psf import AliasingWarning
-from kornia_tidy.reconstruction.tasks import metres
 from tests.base import BaseTester
-from tests.scenes import load_scene
 
 NAMES = list(SYSTEMS)
 HIDING = [name for name in NAMES if SYSTEMS[name].compositing == "occlusion"]
@@ -35,17 +32,6 @@ def psfs(optics, defocus):
 def sharpest(optics, defocus, channel=1):
     """Return the defocus at which the peak of the PSF is highest."""
     return defocus[int(psfs(optics, defocus)[:, channel].amax((1, 2)).argmax())]
-
-
-@pytest.fixture(scope="module")
-def scene():
-    """Return an image and its normalised inverse depth: a real scene if it is available, else dead leaves."""
-    try:
-        image, depth, _ = load_scene("middlebury-motorcycle")
-    except pytest.skip.Exception:
-        image, depth = dead_leaves(200, 300, depth_range=(2.0, 4.5), seed=0)
-    image, inverse = image[:, 100:200, 120:264], 1 / depth[:, 100:200, 120:264]
-    return image, (inverse - inverse.min()) / (inverse.max() - inverse.min())
 
 
 class TestSources(BaseTester):
@@ -132,33 +118,8 @@ class TestSources(BaseTester):
                 light = light[:, margin : margin + 23, margin : margin + 23].mean(0) / (size**2 * 317)
                 assert abs(light - bank[d, channel]).max() < 1e-6 * light.max()
 
-    def test_feature_honest_and_published_psfs_agree_in_size(self):
-        """At defocus where the published grid does not alias, both have the same PSFs at the same scale."""
-        balanced = psfs(preset("phasecam3d", fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
-        paper = psfs(preset("phasecam3d", fidelity="paper"), [-5.0, 0.0, 5.0])
-        likeness = torch.nn.functional.cosine_similarity(balanced.flatten(2), paper.flatten(2), dim=2)
-        assert float(likeness.min()) > 0.97
-        camera = SYSTEMS["phasecam3d"].camera().resized(0.9)  # pixels 11 % too large
-        off = psfs(preset("phasecam3d", camera=camera, fidelity=Fidelity(window=23)), [-5.0, 0.0, 5.0])
-        worse = torch.nn.functional.cosine_similarity(off.flatten(2), paper.flatten(2), dim=2)
-        assert bool((worse < likeness).all())
-
 
 class TestPhysics(BaseTester):
-    def test_feature_a_fresnel_lens_moves_each_colour_by_its_wavelength(self):
-        """Without wrapping all colours would have the same focus; the wrapped phase moves red to -11 and blue to -9."""
-        optics, nodes = preset("fresnel"), [float(psi) for psi in range(-20, 21)]
-        assert sharpest(optics, nodes) == -10
-        assert [sharpest(optics, nodes, channel) for channel in (0, 2)] == [-11, -9]
-
-    def test_feature_tidy_5_averages_what_tidy_1_shows_alone(self):
-        five, one = preset("tidy-5"), preset("tidy-1")
-        assert torch.equal(five.masks.phase[:1], one.masks.phase)
-        window = Fidelity(window=33, stray_light="discard")
-        alone = [preset("tidy-1", masks=PixelwiseMask(initial=h), fidelity=window) for h in five.masks.heights()]
-        mean = torch.stack([psfs(optics, [3.0]) for optics in alone]).mean(0)
-        self.assert_close(psfs(preset("tidy-5", fidelity=window), [3.0]), mean, rtol=0, atol=1e-7)
-
     @torch.no_grad()
     def test_feature_phasecam3d_starts_from_a_mask_that_tells_depth(self):
         nodes = [float(psi) for psi in range(-10, 11)]
@@ -184,52 +145,6 @@ class TestPhysics(BaseTester):
         for channel, index in enumerate((1.49163, 1.49539, 1.49970)):
             expected = scale * ((index - 1) / 0.49539 - 1)  # red is in focus farther away, blue nearer
             assert sharpest(optics, nodes, channel) == pytest.approx(expected, abs=0.5)
-
-    def test_feature_lius_spiral_turns_with_depth_and_not_once_around(self):
-        optics = preset("liu2022-spiral")
-        nodes = [float(psi) for psi in range(-36, 37, 4)]
-        light = psfs(optics, nodes)[:, 1].double()
-        reach = torch.arange(light.shape[-1]) - light.shape[-1] // 2
-        lobe = light * (light > 0.3 * light.amax((1, 2), keepdim=True))
-        up, right = -(lobe * reach[:, None]).sum((1, 2)), (lobe * reach).sum((1, 2))
-        angle = np.unwrap(torch.atan2(up, right).numpy())
-        rotation = np.polyfit(nodes, angle, 1)[0]  # 13 rings: psi / 13, where psi is less at 550 nm than at 530 nm
-        assert rotation == pytest.approx(1 / 13, rel=0.06)
-        lo, hi = optics.camera.defocus_range
-        assert (hi - lo) / 13 < 2 * math.pi
-
-    def test_feature_the_cubic_in_zernikes_is_a_cubic_without_tilt(self):
-        phase = ZernikeMask(initial=cubic_in_zernikes(27.0, 55)).phase[0].detach()
-        x = torch.linspace(-1.1, 1.1, 23)
-        inside = x[:, None] ** 2 + x**2 <= 1
-        expected = CubicMask(27.0).phase[0].detach() - 0.75 * 27 * (x[:, None] + x)
-        self.assert_close(phase[inside], expected[inside], rtol=0, atol=1e-4)
-        optics = preset("sitzmann2018", fidelity=Fidelity(window=129))
-        light = psfs(optics, [0.0])[0, 1]
-        reach = torch.arange(129.0) - 64
-        assert abs(float((light * reach).sum())) < 1  # px
-
-
-class TestScenes(BaseTester):
-    @pytest.mark.parametrize("name", NAMES)
-    def test_feature_all_capture_a_real_scene(self, name, scene):
-        image, inverse_depth = scene
-        optics = preset(name, color_space="linear", sensor=None)
-        with torch.no_grad():
-            light = optics(image, metres(optics.camera, inverse_depth))
-        assert optics.clamped_pixels == 0
-        assert light.shape == image.shape
-        assert float(light.mean()) == pytest.approx(float(image.mean()), rel=0.05)
-
-        def detail(picture):
-            return float(picture.diff(dim=-1).abs().mean() + picture.diff(dim=-2).abs().mean())
-
-        assert detail(light) < 0.9 * detail(image)
-        noisy = preset(name, color_space="linear")
-        with torch.no_grad():
-            coded = noisy(image, metres(noisy.camera, inverse_depth))
-        inside = (light > 0.1) & (light < 0.9)
-        assert float((coded - light)[inside].std()) == pytest.approx(SYSTEMS[name].sigma, rel=0.05)
 
 
 class TestFromPreset(BaseTester):

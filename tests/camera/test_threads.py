@@ -14,8 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
-from kornia_tidy.camera.burst import burst
+from kornia_tidy import Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.masks import NoMask
 from kornia_tidy.psf import exact
 from kornia_tidy.psf import psf_model as module
@@ -87,26 +86,6 @@ class TestThreads(BaseTester):
             count = 2 if kind == "wide blur" else THREADS
             assert in_threads(take, count) == [0] * count
 
-    def test_feature_each_thread_has_a_copy_whose_masks_it_changes(self):
-        """A copy shares nothing: neither the masks nor the PSFs that were remembered of them."""
-        with one_thread_each(), torch.no_grad():
-            optics = camera()
-            heights = [torch.rand(2, 23, 23) * 5 for _ in range(THREADS)]  # radians
-
-            def captures(own: TiDyOptics, index: int) -> list[Tensor]:
-                found = []
-                for shift in range(4):
-                    own.masks.phase.copy_(heights[index] + shift)
-                    found.append(own(*SAMPLES[0]))
-                return found
-
-            expected = [captures(camera(), index) for index in range(THREADS)]
-            before = optics(*SAMPLES[0])
-            found = in_threads(lambda index: captures(copy.deepcopy(optics), index))
-            for one, other in zip(chain(*found), chain(*expected), strict=True):
-                assert torch.equal(one, other)
-            assert torch.equal(optics(*SAMPLES[0]), before)
-
     def test_feature_lenses_that_evict_what_others_remember(self, monkeypatch):
         """Kernels of PSFs are remembered for the process: here so few that each lens drops those of the others."""
         monkeypatch.setattr(exact.MEMORY, "most_bytes", 1 << 16)
@@ -145,24 +124,6 @@ class TestThreads(BaseTester):
 
             for found in in_threads(gradient):
                 assert torch.equal(found, expected)
-
-    def test_feature_each_thread_has_its_noise_from_its_generator(self):
-        optics = camera(sensor=SensorNoise(0.01, full_well=1e4))
-        with one_thread_each(), torch.no_grad():
-            expected = [optics(*SAMPLES[0], generator=torch.Generator().manual_seed(i)) for i in range(THREADS)]
-            found = in_threads(lambda i: optics(*SAMPLES[0], generator=torch.Generator().manual_seed(i)))
-            assert all(map(torch.equal, found, expected))
-
-    def test_feature_bursts_and_copies_while_others_render(self):
-        def work(index: int) -> bool:
-            if index % 2:
-                return torch.equal(copy.deepcopy(optics)(*SAMPLES[0]), expected)
-            return torch.equal(burst(optics, *SAMPLES[0]), shots)
-
-        optics = camera(color_space="linear")
-        with one_thread_each(), torch.no_grad():
-            expected, shots = optics(*SAMPLES[0]), burst(optics, *SAMPLES[0])
-            assert all(in_threads(work))
 
 
 class TestNotes(BaseTester):

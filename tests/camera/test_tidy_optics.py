@@ -12,7 +12,6 @@ from kornia_tidy import (
     DwellTimes,
     Fidelity,
     PixelwiseMask,
-    SensorNoise,
     Spectrum,
     ThinLensCamera,
     TiDyOptics,
@@ -99,22 +98,6 @@ class TestLight(BaseTester):
         coded = optics(image, torch.ones(1, 1, 20, 20))
         self.assert_close(coded, image, rtol=gamma(roundings, torch.float32), atol=0)
 
-    def test_feature_noise_is_added_in_linear_light(self):
-        """sigma = 0.01 of linear full scale; in sRGB it is larger in the shadows by the slope of the curve."""
-        optics = TiDyOptics(sensor=SensorNoise(0.01), fidelity=SMALL)
-        image, depth = torch.full((1, 3, 200, 200), 0.5), torch.ones(1, 1, 200, 200)
-        linear = ((0.5 + 0.055) / 1.055) ** 2.4
-        slope = 1.055 / 2.4 * linear ** (1 / 2.4 - 1)
-        assert float(optics(image, depth).detach().std()) == pytest.approx(0.01 * slope, rel=0.02)
-
-    def test_feature_dwell_times_weight_the_masks(self):
-        masks = PixelwiseMask(2)
-        weighted = TiDyOptics(masks, modulator=DwellTimes((3, 1)), fidelity=SMALL.replace(stray_light="discard"))
-        alone = [
-            TiDyOptics(PixelwiseMask(initial=h), fidelity=weighted.fidelity).psf_bank().psfs for h in masks.heights()
-        ]
-        self.assert_close(weighted.psf_bank().psfs, 0.75 * alone[0] + 0.25 * alone[1], atol=1e-6, rtol=0)
-
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_feature_learns_where_determinism_is_demanded(self, compositing, device):
         """Torch then refuses operations that have no deterministic form."""
@@ -142,9 +125,6 @@ class TestWindow(BaseTester):
         psfs = wide.psf_bank().psfs.detach()
         assert abs(optics.window - enclosing_window(psfs, 0.9)) <= 2  # measured with coarser pixels
         assert optics.window < 41
-
-    def test_feature_random_masks_need_wide_windows(self):
-        assert TiDyOptics(PixelwiseMask(5)).window > TiDyOptics(PixelwiseMask(5, initial="flat")).window
 
     def test_feature_a_window_too_small_warns_with_numbers(self):
         with pytest.warns(UserWarning, match=r"9 px, holds \d+% of the light where it should hold 80%"):

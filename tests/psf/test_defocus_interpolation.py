@@ -140,10 +140,3 @@ class TestContinuousDepth(BaseTester):
         reference = Fidelity.preset("reference").replace(window=5)
         square = TiDyOptics(PixelwiseMask(1), fidelity=reference, aperture=torch.ones(23, 23))
         assert np.diff(square.defocus_nodes).max() < 0.6 * np.diff(nodes).max()
-
-    def test_dynamo_a_band_limited_capture_is_one_graph(self):
-        fidelity = Fidelity(layers="bandlimited", window=5)
-        optics = TiDyOptics(PixelwiseMask(1), DefocusRange(-2, 2), sensor=None, fidelity=fidelity)
-        image, depth = torch.rand(1, 3, 12, 14), torch.rand(1, 1, 12, 14)
-        compiled = torch.compile(optics, fullgraph=True, backend="eager")
-        self.assert_close(compiled(image, depth), optics(image, depth))

@@ -146,18 +146,6 @@ class TestExactBank(BaseTester):
         assert float(bank.energy.max()) <= 1
         assert float(bank.psfs.min()) >= 0
 
-    def test_feature_a_finer_aperture_agrees_where_it_is_the_same_shape(self):
-        """The binary disc, given on cells of a third of a mask pixel, is the same disc."""
-        phase = torch.rand(2, 23, 23, dtype=torch.float64) * 7
-        weights = torch.tensor([0.5, 0.5])
-        coarse = circular_aperture(23)
-        fine = coarse.repeat_interleave(3, 0).repeat_interleave(3, 1)
-        banks = [
-            exact_psf_bank(phase, weights, Pupil(a, p), Spectrum.rgb(), [0.9, 1, 1.1], [-9.0, 4.0], 2e-7, 15, 1e-9)
-            for a, p in ((coarse, 0.1), (fine, 0.1 / 3))
-        ]
-        self.assert_close(banks[0].psfs, banks[1].psfs, rtol=0, atol=1e-12)
-
     def test_feature_channels_average_their_wavelengths(self):
         wavelengths = (500e-9, 600e-9)
         mixed = Spectrum(wavelengths, ((1.0, 3.0),))

@@ -8,10 +8,8 @@ from unittest.mock import patch
 
 import pytest
 import torch
-from torch import nn
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.psf import exact
 from kornia_tidy.psf import psf_model as module
 from kornia_tidy.psf.psf_cache import PSFMemory, values_of
 from tests.base import BaseTester
@@ -40,11 +38,6 @@ def depths_built(optics: TiDyOptics, depth: torch.Tensor) -> int:
 
 
 class TestOnlyWhatTheSceneRequires(BaseTester):
-    def test_feature_a_flat_scene_needs_the_two_depths_around_it(self, optics):
-        assert len(optics.defocus_nodes) == 9
-        assert depths_built(optics, torch.full((1, 1, 16, 16), 0.5)) == 2
-        assert depths_built(optics, torch.linspace(0.2975, 1e9, 256).reshape(1, 1, 16, 16)) == 9
-
     @pytest.mark.parametrize("span", [(0.25, 0.26), (0.2975, 0.3), (0.5, 0.595), (0.6, 1.0), (3.0, float("inf"))])
     def test_feature_present_depths_give_the_capture_of_all_depths(self, optics, span):
         near, far = span
@@ -135,18 +128,6 @@ class TestPSFMemory(BaseTester):
         assert image.grad is not None
         self.assert_close(coded, expected)
 
-    @torch.no_grad()
-    def test_feature_the_same_whatever_depths_were_asked_for_before(self, optics, monkeypatch):
-        """Far depths take more points in the pupil; near focus they must not change the last bit."""
-        found = []
-        for before in ([], [-20.0, 0.0]):
-            for place in (exact, module):
-                monkeypatch.setattr(place, "MEMORY", PSFMemory())
-            if before:
-                optics.psf_bank(defocus=before)
-            found.append(optics.psf_bank(defocus=[-0.5, 0.0, 0.5]).psfs)
-        assert torch.equal(*found)
-
     def test_feature_what_was_not_used_for_long_goes(self):
         memory, asked = PSFMemory(3 * 40), []
 
@@ -195,23 +176,6 @@ class TestPSFMemory(BaseTester):
             masks.table = {"settings": [table + change, (1, [2])]}
             seen.append(values_of(masks))
         assert len(set(seen)) == 2
-
-    @torch.no_grad()
-    @pytest.mark.parametrize("kind", [torch.bfloat16, torch.float16, torch.float64])
-    def test_feature_a_learnable_aperture_in_any_dtype(self, kind):
-        optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=SMALL, aperture=nn.Parameter(torch.ones(23, 23)))
-        image, depth = torch.rand(1, 3, 16, 16), torch.full((1, 1, 16, 16), 0.5)
-        assert optics.to(kind)(image, depth).isfinite().all()
-
-    def test_feature_what_comes_out_does_not_depend_on_what_is_remembered(self):
-        def make(nodes: tuple[float, ...]) -> tuple[torch.Tensor]:
-            return (torch.tensor(nodes)[:, None].expand(-1, 3),)
-
-        memory = PSFMemory()
-        for nodes in ((1.0,), (0.0, 2.0), (0.0, 1.0, 2.0, 3.0), (0.0, 3.0)):
-            (found,) = memory.recall((), nodes, make)
-            assert found.tolist() == [[psi] * 3 for psi in nodes]
-            assert found.is_contiguous()
 
     def test_exception_nothing_is_kept_of_what_could_not_be_made(self):
         memory = PSFMemory()

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy import Fidelity, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.psf.spectral_binning import bin_spectrum
 from tests.base import BaseTester
@@ -71,49 +71,10 @@ class TestFewerWavelengths(BaseTester):
         many = Spectrum((400e-9, 500e-9, 510e-9, 600e-9), ((0, 1, 1, 0), (0, 0, 0, 1)))
         assert bin_spectrum(many, 3).wavelengths == pytest.approx((500e-9, 510e-9, 600e-9))
 
-    @pytest.mark.parametrize("count", [3, 4, 7, 16])
-    def test_feature_colours_with_spectra_stay_what_they_are(self, count):
-        """A basis is checked where a spectrum is made; grey stays flat."""
-        few = bin_spectrum(camera_spectrum(samples=31, reflectance=True), count)
-        np.testing.assert_allclose(np.sum(few.basis, 0), 1, atol=1e-9)
-        assert len(few.basis[0]) == count
-
-    def test_feature_psfs_come_nearer_with_more_and_beat_equal_slices(self):
-        lens = TiDyOptics(PixelwiseMask(2, generator=torch.Generator().manual_seed(3)), fidelity=Fidelity(window=17))
-        nodes, fidelity = (-20.0, 0.0, 12.0), lens.fidelity
-
-        def psfs(spectrum):
-            with torch.no_grad():
-                return lens.psf_model.replace(spectrum=spectrum, fidelity=fidelity).psf_bank(defocus=nodes).psfs
-
-        truth = psfs(MANY)
-        errors = {
-            n: [float((psfs(few) - truth).abs().sum((2, 3)).mean()) for few in (bin_spectrum(MANY, n), equal)]
-            for n, equal in ((n, camera_spectrum(samples=n)) for n in (3, 6, 12))
-        }
-        ours = [own for own, _ in errors.values()]
-        assert ours == sorted(ours, reverse=True)
-        assert ours[-1] < 0.003
-        assert all(own < 0.7 * equal for own, equal in errors.values())
-
-    def test_feature_a_camera_at_fewer_is_a_camera_made_of_them(self):
-        masks, few = PixelwiseMask(1), bin_spectrum(MANY, 4)
-        image, depth = torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)
-        own = TiDyOptics(masks, sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=4))
-        made = TiDyOptics(masks, sensor=None, spectrum=few, fidelity=Fidelity(window=9))
-        self.assert_close(own(image, depth), made(image, depth), rtol=0, atol=0)
-        assert own(image[:1], depth).shape == (1, 24, 24)  # one channel is taken at one wavelength as ever
-
     def test_feature_gradients_reach_the_masks(self):
         own = TiDyOptics(sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=2))
         own(torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)).square().mean().backward()
         assert float(own.masks.phase.grad.abs().max()) > 0
-
-    def test_dynamo(self):
-        own = TiDyOptics(PixelwiseMask(1), sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=2))
-        image, depth = torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)
-        compiled = torch.compile(own, backend="eager", fullgraph=True)
-        self.assert_close(compiled(image, depth), own(image, depth))
 
     @pytest.mark.parametrize("count", [0, -1, 1.5])
     def test_exception_names_the_count(self, count):

@@ -38,13 +38,6 @@ class TestGeometricPSFs(BaseTester):
         self.assert_close(psf.sum(), torch.tensor(1.0, dtype=torch.float64), rtol=0, atol=1e-12)
         assert float(psf.min()) >= 0
 
-    def test_feature_a_square_aperture_makes_a_uniform_square(self):
-        """Two cells of half a radius: the image is 4 pixels wide for r = 4, with half pixels at its edges."""
-        psi = 4 * math.pi * STEP / REFERENCE_WAVELENGTH
-        psf = geometric_psfs(torch.ones(2, 2), 0.5, [psi], STEP, 7)[0]
-        line = torch.tensor([0, 0.5, 1, 1, 1, 0.5, 0], dtype=torch.float64) / 4
-        self.assert_close(psf, line[:, None] * line, rtol=0, atol=1e-12)
-
     def test_feature_light_through_a_cell_at_the_edge_is_its_open_area(self):
         """Two cells, one half open: two thirds of the light in the half of the image that is theirs."""
         aperture = torch.tensor([[1.0, 0.5], [1.0, 0.5]], dtype=torch.float64).as_subclass(OpenArea)
@@ -94,12 +87,6 @@ class TestWideBlur(BaseTester):
         for group in blur.groups:
             middle = blur_radius(group.nodes[len(group.nodes) // 2], STEP)
             assert (group.grid == 1) == (middle <= FINE_RADIUS)
-
-    def test_feature_layers_stand_closer_near_focus(self):
-        nodes = torch.tensor(wide_blur((-572.0, 572.0), STEP, PUPIL).nodes)
-        gaps = nodes.diff() * REFERENCE_WAVELENGTH / (math.pi * STEP)
-        assert 0.08 < float(gaps.min()) == float(gaps[len(gaps) // 2]) <= 0.1 + 1e-5
-        assert 2.0 < float(gaps[0]) < 5.0
 
     def test_feature_only_the_layers_of_the_scene_count(self):
         blur = wide_blur((-572.0, 572.0), STEP, PUPIL)

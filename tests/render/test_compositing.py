@@ -3,19 +3,14 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.signal import convolve2d
 
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, render
 from tests.base import BaseTester
 from tests.render.render_tester import METHODS
-from tests.render.scenes import Bank, brute_render, brute_weights, make_bank, make_scene, modelled, squares
+from tests.render.scenes import Bank, brute_render, make_bank, make_scene, modelled, squares
 
 SUMS = ("gather", "scatter")  # the others renormalise
 over_compositing = pytest.mark.parametrize("compositing", COMPOSITING)
@@ -71,40 +66,6 @@ class TestRender(BaseTester):
         coded = render(image, defocus, bank, layers="nearest", correlate=True)
         self.assert_close(coded[0], expected, rtol=0, atol=1e-12)
 
-    @pytest.mark.parametrize(
-        ("border", "code"),
-        [
-            ("reflect", cv2.BORDER_REFLECT_101),
-            ("replicate", cv2.BORDER_REPLICATE),
-            ("zero", cv2.BORDER_CONSTANT),
-        ],
-    )
-    def test_feature_gather_equals_opencv_a_layer(self, border, code, device):
-        """OpenCV's filter2D correlates: the PSF is turned for a convolution and left for a correlation."""
-        bank = make_bank(3, 3, 7, device=device)
-        image, defocus = make_scene(bank, 1, 20, 31)
-        planes = image[0].permute(1, 2, 0).cpu().numpy()
-        for correlate in (False, True):
-            expected = np.zeros_like(planes)
-            for d, own in enumerate(brute_weights(defocus[0, 0].cpu().numpy(), bank.defocus.cpu().numpy(), "nearest")):
-                assert own.any()
-                for c in range(3):
-                    psf = bank.psfs[d, c].cpu().numpy()
-                    psf = np.ascontiguousarray(psf if correlate else psf[::-1, ::-1])
-                    expected[..., c] += own * cv2.filter2D(planes[..., c], -1, psf, borderType=code)
-            coded = render(image, defocus, bank, layers="nearest", border=border, correlate=correlate)
-            self.assert_close(coded[0].permute(1, 2, 0).cpu(), torch.from_numpy(expected), rtol=0, atol=1e-12)
-
-    @over_sums
-    @pytest.mark.parametrize(("border", "mode", "boundary"), [("valid", "valid", "fill"), ("circular", "same", "wrap")])
-    def test_feature_equals_scipy_for_one_layer(self, compositing, border, mode, boundary, device):
-        bank = make_bank(1, 2, 9, device=device)
-        image, defocus = make_scene(bank, 1, 12, 15)
-        coded = render(image, defocus, bank, compositing, border=border)
-        for c in range(2):
-            expected = convolve2d(image[0, c].cpu(), bank.psfs[0, c].cpu(), mode=mode, boundary=boundary)
-            self.assert_close(coded[0, c].cpu(), torch.from_numpy(expected), rtol=0, atol=1e-13)
-
     # Conventions
 
     @over_sums
@@ -149,28 +110,6 @@ class TestRender(BaseTester):
         coded = render(image, defocus, bank, "scatter", layers=layers, border="circular")
         rtol = 1e-13 if dtype == torch.float64 else 1e-6
         self.assert_close(coded.mean((-2, -1)), image.mean((-2, -1)), rtol=rtol, atol=0)
-
-    @over_compositing
-    @given(a=st.floats(-5, 5), b=st.floats(-5, 5), seed=st.integers(0, 99), border=st.sampled_from(BORDERS))
-    @settings(max_examples=25)
-    def test_property_rendering_is_linear_in_the_image(self, compositing, a, b, seed, border):
-        torch.manual_seed(seed)
-        bank = make_bank(3, 1, 5, light=0.9, veil=True)
-        (first, defocus), (second, _) = make_scene(bank), make_scene(bank)
-        coded = [render(x, defocus, bank, compositing, border=border) for x in (first, second, a * first + b * second)]
-        atol = 1e-10 if compositing == "occlusion" else 1e-13
-        self.assert_close(coded[2], a * coded[0] + b * coded[1], rtol=0, atol=atol)
-
-    @over_sums
-    def test_property_the_mean_of_renders_is_the_render_of_the_mean_bank(self, compositing, device, dtype):
-        """What lets states be averaged before any image is touched."""
-        banks = [make_bank(6, 3, 7, dtype=dtype, device=device, light=0.8, veil=True) for _ in range(5)]
-        image, defocus = make_scene(banks[0], 2, 24, 17)
-        psfs, veil = (torch.stack([getattr(b, name) for b in banks]).mean(0) for name in ("psfs", "veil"))
-        mean_bank = replace(banks[0], psfs=psfs, veil=veil)
-        mean = torch.stack([render(image, defocus, bank, compositing) for bank in banks]).mean(0)
-        atol = 1e-12 if dtype == torch.float64 else 1e-5
-        self.assert_close(render(image, defocus, mean_bank, compositing), mean, rtol=0, atol=atol)
 
     @over_compositing
     def test_property_linear_equals_nearest_on_the_nodes(self, compositing, device, dtype):

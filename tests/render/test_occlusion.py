@@ -17,14 +17,6 @@ from tests.render.scenes import Bank, make_bank, make_scene, squares
 from tests.rounding import gamma
 
 
-def near_on_far(size, side, device, dtype):
-    """A defocus map of a near square (10 rad) on a far ground (0 rad)."""
-    defocus = torch.zeros(1, 1, size, size, device=device, dtype=dtype)
-    start = (size - side) // 2
-    defocus[..., start : start + side, start : start + side] = 10
-    return defocus
-
-
 class TestOcclusion(BaseTester):
     def test_feature_cumulative_weight_adds_up_the_layers(self, device):
         bank = make_bank(6, device=device)
@@ -69,46 +61,6 @@ class TestOcclusion(BaseTester):
         self.assert_close(white, torch.ones_like(white), rtol=0, atol=EPSILON / 0.015)
         speckled = render(torch.ones_like(image), defocus, bank, "occlusion", border=border, method=method)
         assert float((speckled - 1).abs().max()) < 1e-3  # a pixel's own layer may have a weight of near to nothing
-
-    @pytest.mark.parametrize("method", METHODS)
-    def test_property_a_near_opaque_layer_hides_the_far_one(self, method, device, dtype):
-        """Within the square by more than a PSF's radius nothing of the ground's light arrives; gather lets it in."""
-        bank = Bank(make_bank(2, 1, 7, dtype=dtype, device=device).psfs, torch.tensor([0.0, 10.0], device=device))
-        defocus = near_on_far(41, 21, device, dtype)
-        ground = (defocus == 0).to(dtype) * 100
-        coded = render(ground, defocus, bank, "occlusion", layers="nearest", method=method)
-        assert float(coded[..., 13:28, 13:28].abs().max()) < 1e-9
-        assert float(coded[..., :7, :].min()) > 99.9
-
-    @pytest.mark.parametrize("method", METHODS)
-    def test_property_a_sharp_near_edge_does_not_bleed(self, method, device, dtype):
-        """An occluder in focus on a blurred ground: each of its pixels is its own, and the ground beside it is ground.
-
-        Gather instead brings the ground's blur of the occluder onto the ground.
-        """
-        psfs = torch.zeros(2, 1, 7, 7, device=device, dtype=dtype)
-        psfs[1, 0, 3, 3] = 1
-        psfs[0] = 1 / 49
-        bank = Bank(psfs, torch.tensor([0.0, 10.0], device=device))
-        defocus = near_on_far(31, 11, device, dtype)
-        near = defocus == 10
-        image = torch.where(near, 0.9, 0.2).to(dtype)
-        coded = render(image, defocus, bank, "occlusion", layers="nearest", method=method)
-        self.assert_close(coded, image, rtol=0, atol=1e-4)
-        assert float((render(image, defocus, bank, layers="nearest") - image).abs().max()) > 0.1
-
-    @pytest.mark.parametrize("method", METHODS)
-    def test_property_a_blurred_near_edge_is_the_mix_of_both(self, method, device, dtype):
-        """Plain near, plain ground: the share of the near layer's PSF that sees it, and the ground for the rest."""
-        bank = Bank(make_bank(2, 1, 7, dtype=dtype, device=device).psfs, torch.tensor([0.0, 10.0], device=device))
-        defocus = near_on_far(41, 21, device, dtype)
-        near = (defocus == 10).to(dtype)
-        coded = render(0.2 + 0.7 * near, defocus, bank, "occlusion", layers="nearest", method=method)
-        share = gather(near, torch.full_like(near, 10), bank.defocus, bank.psfs)
-        ground = gather(1 - near, torch.zeros_like(near), bank.defocus, bank.psfs)
-        mixed = 0.9 * share + 0.2 * (1 - share)
-        sees_ground = ground > 1e-3
-        self.assert_close(coded[sees_ground], mixed[sees_ground], rtol=0, atol=1e-3)
 
     @given(seed=st.integers(0, 99), border=st.sampled_from(BORDERS), layers=st.sampled_from(["nearest", "linear"]))
     @settings(max_examples=25)

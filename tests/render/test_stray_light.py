@@ -127,16 +127,6 @@ class TestShareWithin(BaseTester):
         expected = brute_share_within(*shape, size // 2)
         self.assert_close(share_within(*shape, size, device).cpu().numpy(), expected, rtol=0, atol=1e-13)
 
-    @pytest.mark.parametrize("size", [1, 61, 257])
-    def test_feature_rings_that_stand_together_are_as_each_alone(self, size):
-        """A line of 3000 pixels has 23 times the rings. A group of them spans 1 + 1/16 of its radius at most."""
-        at = np.arange(3000)
-        k = np.abs(at[::100, None] - at)
-        radius = size // 2
-        each = np.where(k > radius, (radius + 0.5) / ((k - 0.5) * (k + 0.5) * 8 * k.clip(1)), 0).sum(1)
-        own = share_within(1, 3000, size)[0, ::100].numpy()
-        self.assert_close(own, each, rtol=1 / 16, atol=0)
-
     @pytest.mark.parametrize("size", [1, 3, 9, 31])
     def test_property_it_is_a_share_and_symmetric(self, size):
         share = share_within(12, 17, size)

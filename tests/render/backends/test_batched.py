@@ -19,7 +19,7 @@ from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.scene import Labels, layered_scene
 from tests.base import BaseTester
 from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
-from tests.render.scenes import Bank, brute_render, make_bank, make_scene, squares
+from tests.render.scenes import Bank, make_bank, make_scene, squares
 from tests.simulated_device import SimulatedDevice
 
 SUMS = ("gather", "scatter")
@@ -106,15 +106,6 @@ class TestBatchedRender(RenderTester):
 
     # Equal to sums over pixels, which share no code with either renderer
 
-    @pytest.mark.parametrize("compositing", SUMS)
-    @pytest.mark.parametrize("border", BORDERS)
-    def test_feature_equals_the_sum_over_pixels(self, compositing, border, device):
-        bank = make_bank(4, 1, 3, device=device, light=0.8, veil=True)
-        image, defocus = make_scene(bank, 1, 20, 29)  # several blocks of 6 x 12 pixels
-        expected = brute_render(image, defocus, bank, compositing=compositing, layers="linear", border=border)
-        coded = render_by(SMALL_TILES, image, defocus, bank, compositing, border=border)
-        self.assert_close(coded, expected, rtol=0, atol=1e-14)
-
     # Memory
 
     @pytest.mark.parametrize("compositing", SUMS)
@@ -153,17 +144,6 @@ class TestBatchedRender(RenderTester):
         with largest:
             render_by(BatchedBackend(chunk_bytes=chunk), image, defocus, bank, compositing).sum().backward()
         assert largest.bytes < most  # two tiles of 20 layers at least; the planes of all layers are 5 and 10 MB
-
-    def test_feature_occlusion_hides_what_is_behind_an_opaque_layer(self):
-        """Where the nearest layer is all there is, nothing shines through, and nothing behind has a gradient."""
-        bank = make_bank(layers=3, channels=1, size=3)
-        image, defocus = torch.rand(1, 1, 8, 8, dtype=torch.float64), torch.full((1, 1, 8, 8), -4.0).double()
-        psfs = bank.psfs.clone().requires_grad_()
-        coded = render_by("batched", image, defocus, Bank(psfs, bank.defocus), "occlusion")
-        coded.sum().backward()
-        assert psfs.grad is not None
-        assert float(psfs.grad[:2].abs().max()) <= 1e-9
-        assert float(psfs.grad[2].abs().max()) > 1e-3
 
 
 class LargestTensor(TorchDispatchMode):

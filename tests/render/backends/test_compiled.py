@@ -88,12 +88,6 @@ class TestCompiledRender(RenderTester):
             atol = (2e-5 if dtype == torch.float32 else 1e-10) * float(expected.abs().max())
             self.assert_close(found, expected, rtol=0, atol=atol)
 
-    def test_feature_a_large_psf(self):
-        """Of 257 px, beyond the image, where a border of zeros allows it."""
-        bank = make_bank(3, 1, 257, dtype=torch.float64)
-        image, defocus = make_scene(bank, 1, 60, 90)
-        self.assert_equals_dense("compiled", image, defocus, bank, "gather", 1e-12, border="zero")
-
     @pytest.mark.parametrize("compositing", COMPOSITING)
     @given(data=st.data())
     @settings(max_examples=30)
