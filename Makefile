@@ -8,7 +8,7 @@ DOCS_READY := $(VENV)/.docs-ready
 WHEEL_READY := $(VENV)/.wheel-ready
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable sanitize mutations fuzz extremes lint docs wheel bench targets clean
+.PHONY: help demo test test-portable sanitize fuzz extremes lint docs wheel bench targets clean
 .DELETE_ON_ERROR:
 
 help:
@@ -18,7 +18,6 @@ help:
 	@echo "make test-portable  the tests as on other machines: vector widths, compilers, none, threads; up to 30 minutes;"
 	@echo "              ARGS='--list' shows them, ARGS='--only aten' runs some, ARGS=--quick a share of each"
 	@echo "make sanitize the C sources under address and undefined-behaviour sanitizers: minutes, ARGS='--shapes 100' less"
-	@echo "make mutations  damaged files through the command: 200 of them, or ARGS='--count 5000 --seed 1 --kind png'"
 	@echo "make extremes   how exact captures are at the extremes, as docs/record/extremes.md: minutes; ARGS=--quick a part of it"
 	@echo "make fuzz     damaged files through every reading function: 2000, or ARGS='--count 100000 --seed 1 --guided'"
 	@echo "make lint     style, spelling and types"
@@ -44,12 +43,10 @@ test-portable: $(READY)
 sanitize: $(READY)
 	@$(BIN)/python -m tests.kernels.sanitize $(ARGS)
 
-# What fails is kept in outputs/mutations.
-mutations: $(READY)
-	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations $(or $(ARGS),--count 200)
-
 extremes: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.extremes $(ARGS)
+
+# What fails is kept in outputs/mutations.
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.mutations.reading $(or $(ARGS),--count 2000)
 

@@ -6,7 +6,7 @@ all else bound: other tensors, modules, the draws of what is random.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -30,7 +30,6 @@ from kornia_tidy import (
 )
 from kornia_tidy import augmentation as ours
 from kornia_tidy.data import fill_holes
-from tests.augmentation.coded_scene import MarkDepth
 from tests.camera.pipeline_samples import camera
 
 Call = Callable[[Tensor], Tensor]
@@ -63,6 +62,13 @@ class Operation(NamedTuple):
     """Whether compiling it takes seconds (kornia's containers, loops over states) or is tested in its own file too."""
     wide: bool = False
     """Whether float32 comes out for half precision: weights and sums, not images."""
+
+
+class MarkDepth(ours.DepthAugmentation):
+    """Writes the depth that it is given into the first channel, where the optics would blur by it."""
+
+    def change(self, image: Tensor, depth: Tensor, params: Mapping[str, Tensor]) -> Tensor:
+        return torch.cat([depth.expand(len(image), -1, -1, -1).to(image), image[:, 1:]], 1)
 
 
 def wide_type(image: Tensor) -> torch.dtype:

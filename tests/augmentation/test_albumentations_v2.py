@@ -79,11 +79,6 @@ class TestOpticsTransform(BaseTester):
         assert np.allclose(out["bboxes"], boxes)
         assert out["label"] == 3
 
-    def test_feature_probability(self):
-        given = arrays()
-        out = A.Compose([OpticsTransform(camera(), p=0.0)], **DEPTH)(**given)
-        assert np.array_equal(out["image"], given["image"])
-
     def test_feature_the_mask_of_holes_is_moved_beyond_the_image_too(self):
         """Whether or not the picture is taken, so that a data loader finds one set of keys."""
         given = arrays()

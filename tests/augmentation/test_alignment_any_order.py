@@ -1,13 +1,11 @@
 """All orders of geometry, optics and photometry in three libraries: aligned image and depth, or an error.
 
-Every order of two warps, and random chains of up to three, interpolating ones (affine, rotation, resize) too, which
-tests/augmentation/test_alignment.py leaves out.
+Random chains of up to three warps, interpolating ones (affine, rotation, resize) too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import combinations_with_replacement, permutations
+from collections.abc import Sequence
 
 import kornia.augmentation as K
 import numpy as np
@@ -51,11 +49,6 @@ def orders() -> st.SearchStrategy[list[str]]:
     """Up to three warps, one dimming and the optics, in any order."""
     parts = st.lists(st.sampled_from(WARPS), max_size=3)
     return parts.flatmap(lambda warps: st.permutations([*warps, "dim", "optics"]))
-
-
-def every_order(*warps: str) -> Iterator[tuple[str, ...]]:
-    """All 24 orders of two warps, the dimming and the optics."""
-    return permutations([*warps, "dim", "optics"])
 
 
 def check_kornia(names: Sequence[str], seed: int, keys: list[str] | None) -> None:
@@ -140,22 +133,6 @@ class TestAlignmentInAnyOrder(BaseTester):
         image, depth = ratio_scene()
         with pytest.raises(AssertionError):
             assert_ratios(KORNIA[warp]()(image), depth, False, 1)
-
-    @pytest.mark.parametrize("library", ["kornia", "torchvision", "albumentations"])
-    @pytest.mark.parametrize("warps", list(combinations_with_replacement(WARPS, 2)), ids=" and ".join)
-    def test_property_every_order_of_two_warps_optics_and_photometry(self, library, warps):
-        """All 24 orders of each of the 21 pairs of warps, in each library."""
-        if library == "torchvision":
-            need_torchvision(module=False)
-        elif library == "albumentations":
-            need("albumentations", module=False)
-        for seed, names in enumerate(every_order(*warps)):
-            if library == "kornia":
-                check_kornia(names, seed, ["input", "mask"])
-            elif library == "torchvision":
-                check_torchvision(names, seed, "image")
-            else:
-                check_albumentations(names, seed, nested=False)
 
     @EXAMPLES
     @given(orders(), st.integers(0, 2**31), st.sampled_from([["input", "mask"], ["input", "mask", "mask"], None]))

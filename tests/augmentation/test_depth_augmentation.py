@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import copy
-import pickle
-
 import kornia.augmentation as K
 import pytest
 import torch
@@ -59,14 +56,6 @@ class TestInAugmentationSequential(BaseTester):
         expected = crops(corners, camera_of(optics)(image.flip(-1), depth.flip(-1)).flip(-1))
         self.assert_close(coded, expected, rtol=0, atol=1e-6)
         assert torch.equal(out, crops(corners, depth))
-
-    def test_feature_a_copy_and_a_pickle_work_and_hold_no_depth(self):
-        sequence, (image, depth) = chain(augmentation(), data_keys=["input", "mask"]), scene(2)
-        small = len(pickle.dumps(sequence))
-        expected = sequence(image, depth)
-        for other in (copy.deepcopy(sequence), pickle.loads(pickle.dumps(sequence))):
-            assert all(map(torch.equal, other(image, depth, params=sequence._params), expected))
-        assert len(pickle.dumps(sequence)) < small + 20_000  # the scene has 46 kB
 
     def test_feature_of_several_masks_the_named_one_is_the_depth(self):
         optics, (image, depth) = augmentation(), scene(2)

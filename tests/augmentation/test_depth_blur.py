@@ -131,10 +131,6 @@ class TestDepthBlur(BaseTester):
         with pytest.warns(UserWarning, match="300 m away.*are these millimetres"):
             depth_blur(image, depth, 1.0, 4.0)
 
-    def test_smoke_discs_sum_to_one(self):
-        for radius in (0, 0.5, 1.0, 3.3, 16.0):
-            assert abs(float(disc(radius, 33).sum()) - 1) < 1e-12
-
 
 class TestRandomDepthBlur(BaseTester):
     def test_feature_millimetres_are_told_once_and_metres_are_not(self, monkeypatch, device):

@@ -152,13 +152,6 @@ class TestRandomTiDyOptics(BaseTester):
         assert gradient.isfinite().all()
         assert (gradient.abs().amax((1, 2)) > 0).all()
 
-    def test_feature_the_camera_itself_is_left_as_it_was(self):
-        optics, (image, depth) = camera(sensor=None), scene(2)
-        before, parts = optics(image, depth), (optics.camera, optics.modulator, optics.sensor, optics.window)
-        RandomTiDyOptics(optics, **ALL, p=1.0)(image, depth)
-        assert (optics.camera, optics.modulator, optics.sensor, optics.window) == parts
-        assert torch.equal(optics(image, depth), before)
-
     def test_feature_the_draws_hold_no_depth(self):
         optics, (image, depth) = RandomTiDyOptics(camera(), **ALL), scene(2)
         optics(image, depth)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import re
 import struct
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -74,12 +73,3 @@ class TestDecodeNpy(BaseTester):
     def test_exception_cut_short(self, kept):
         with pytest.raises(ValueError, match="NPY"):
             decode_npy(npy(np.zeros(2))[:kept])
-
-    def test_exception_every_flipped_bit_of_a_header_is_read_or_refused(self):
-        """NumPy's own reader lets SyntaxError, TokenError, TypeError and others out."""
-        data = npy(np.zeros((4, 6), np.float32))
-        for bit in range(8 * 128):
-            damaged = bytearray(data)
-            damaged[bit // 8] ^= 1 << (bit % 8)
-            with suppress(ValueError):
-                assert decode_npy(bytes(damaged)).size

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from kornia_tidy.data import SUNRGBD
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 
 
 def write(root, frame, millimetres, part="depth_bfx"):
@@ -42,16 +40,6 @@ class TestSUNRGBD(BaseTester):
         write(tmp_path, "a", 2000, "depth")
         (sample,) = SUNRGBD(tmp_path, raw=True)
         self.assert_close(sample["depth"].unique(), torch.tensor([2.0]))
-
-    def test_feature_a_real_frame(self, tmp_path):
-        folder = shared("data/rgbd/open3d/RGBD/other_formats", {"SUN_*": 2})
-        for part, file in (("image", "SUN_color.jpg"), ("depth_bfx", "SUN_depth.png")):
-            (tmp_path / "f" / part).mkdir(parents=True)
-            shutil.copy(folder / file, tmp_path / "f" / part)
-        (sample,) = SUNRGBD(tmp_path)
-        known = sample["depth"][sample["mask"]].double().numpy()
-        assert np.quantile(known, [0.005, 0.5, 0.995]) == pytest.approx([1.09, 2.723, 9.331], rel=0.01)
-        assert sample["mask"].float().mean().item() == pytest.approx(0.818, abs=6e-4)
 
     def test_exception(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="there is no folder"):

@@ -1,16 +1,13 @@
 from __future__ import annotations
 
-import contextlib
 import io
 import re
 import shutil
 import struct
 import subprocess
-import warnings
 from collections import Counter
 
 import cv2
-import imagecodecs
 import numpy as np
 import pytest
 from PIL import Image
@@ -47,12 +44,6 @@ def jpeg(picture: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", picture)[1].tobytes()
 
 
-def unconverted_jpeg(picture: np.ndarray) -> bytes:
-    space = {1: "grayscale", 3: "rgb", 4: "cmyk"}.get(picture.shape[2], "unknown")
-    picture = picture[..., 0] if picture.shape[2] == 1 else picture
-    return imagecodecs.jpeg8_encode(picture, level=95, colorspace=space, outcolorspace=space, subsampling="444")
-
-
 def walked(count: int, seed: int, folder) -> Counter[str]:
     """Read combinations of properties; return how many were read and refused."""
     counts: Counter[str] = Counter()
@@ -77,13 +68,6 @@ class TestReadsWhatIsStored(BaseTester):
         data = by_pillow(picture, compression=compression)
         assert np.array_equal(decoded(data).values, by_opencv(data))
 
-    @pytest.mark.parametrize("compression", ["raw", "group3", "group4", "tiff_ccitt", "tiff_lzw"])
-    def test_feature_one_bit_equals_libtiff(self, compression):
-        data = by_pillow(GREY[..., 0] > 99, compression=compression)
-        found = decoded(data)
-        assert found.white == 1
-        assert np.array_equal(found.values * np.uint8(255), by_opencv(data))
-
     @pytest.mark.parametrize(
         "options",
         ["-c jpeg:90", "-c jpeg:r -t -w 32 -l 16", "-c lzw:2 -p separate", "-c zip:2 -B", "-c zstd:2 -8 -r 7",
@@ -99,25 +83,6 @@ class TestReadsWhatIsStored(BaseTester):
             pytest.skip(f"this tiffcp does not write {options}")
         data = (tmp_path / "b.tif").read_bytes()
         assert np.array_equal(decoded(data).values, by_opencv(data) if "jpeg" in options else RGB)
-
-    @pytest.mark.parametrize("picture", [RGB, GREY, np.concatenate([RGB, GREY], 2), np.concatenate([GREY, GREY], 2)])
-    @pytest.mark.parametrize("layout", [{}, {"rows_per_strip": 16}, {"tile": (16, 32)}])
-    def test_feature_jpeg_of_rgb_grey_and_alpha(self, picture, layout):
-        """Without conversion of colours, as GDAL writes it, and whether they are called RGB or grey."""
-        size = layout.get("tile", (layout.get("rows_per_strip", 40), 60))
-        shape = (*RGB.shape[:2], picture.shape[2])
-        places = [(y, x) for y in range(0, 40, size[0]) for x in range(0, 60, size[1])]
-        parts = [picture[y : y + size[0], x : x + size[1]] for y, x in places]
-        if "tile" in layout:
-            parts = [np.pad(p, ((0, size[0] - p.shape[0]), (0, size[1] - p.shape[1]), (0, 0)), "edge") for p in parts]
-        coded = [unconverted_jpeg(np.ascontiguousarray(part)) for part in parts]
-        extra = {} if picture.shape[2] % 2 else {"extra": (2,)}
-        for photometric in (1, 2) if shape[2] == 3 else (2 if shape[2] == 4 else 1,):
-            data = tiff(Page(picture, photometric=photometric, compression=7, segments=coded, **layout, **extra))
-            values = decoded(data).values
-            assert np.abs(values.astype(int) - picture[..., : values.shape[2]]).max() < 25
-            if (shape[2], photometric) in {(1, 1), (3, 2)}:
-                assert np.array_equal(values, by_opencv(data))
 
     def test_feature_lzw_of_before_1992(self):
         """With the bits of codes the other way round."""
@@ -277,13 +242,3 @@ class TestRefused(BaseTester):
         for read in (read_image, read_depth):
             with pytest.raises(ValueError, match=re.escape("a.tif: it holds 3 pictures (pages): save the one that is")):
                 read(tmp_path / "a.tif")
-
-    def test_feature_no_warning_and_no_word_of_a_library(self, capfd):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            for damage in (b"\xff" * 400, bytes(400), b"\x80" + bytes(99)):
-                for compression in (5, 7, 8, 32773, 2, 3, 4, 50000, 34925):
-                    page = Page(GREY, 1 if compression in {2, 3, 4} else 8, compression=compression, segments=[damage])
-                    with contextlib.suppress(ValueError):
-                        decoded(tiff(page))
-        assert capfd.readouterr() == ("", "")

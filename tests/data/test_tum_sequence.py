@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from kornia_tidy.data import TUMSequence
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 
 IMAGES = ("10.000", "10.033", "10.066", "11.5")
 DEPTHS = ("10.002", "10.030", "10.040", "10.090", "12.5")
@@ -86,12 +84,3 @@ class TestTUMSequence(BaseTester):
     def test_exception_nothing_there(self, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"rgb\.txt: there is no such file"):
             TUMSequence(tmp_path)
-
-    def test_feature_a_real_frame(self, tmp_path):
-        folder = shared("data/rgbd/open3d/RGBD/other_formats", {"TUM_*": 2})
-        for part, kind in (("rgb", "color"), ("depth", "depth")):
-            (tmp_path / part).mkdir()
-            shutil.copy(folder / f"TUM_{kind}.png", tmp_path / part / "1.5.png")
-            (tmp_path / f"{part}.txt").write_text(f"1.5 {part}/1.5.png\n")
-        (sample,) = TUMSequence(tmp_path)
-        assert sample["depth"][sample["mask"]].median().item() == pytest.approx(2.415, rel=0.01)

@@ -25,13 +25,11 @@ from kornia_tidy.files import replacing
 from kornia_tidy.signals import is_command
 from tests.base import BaseTester
 from tests.forks import fork, wait
-from tests.hostile.limited import apart, command
+from tests.hostile.limited import command
 from tests.training.coded_datasets.samples import contents
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 RENDER = ("render", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--masks", "1", "--fidelity", "draft")
-TRAIN = ("train", "--resume", "--data", "dead-leaves", "--size", "48", "--scenes", "6", "--validation-scenes", "2",
-         "--epochs", "2", "--masks", "1", "--width", "4", "--batch", "2", "--save-every", "1")  # fmt: skip
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 WORD = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
@@ -78,31 +76,12 @@ def disturb(argv, folder, moments, seed):
     return stopped
 
 
-def stopped_trainings(folder):
-    """Disturb a training; return how often it was stopped. Its imports are none of what is disturbed."""
-    importlib.import_module("kornia_tidy.training.run")
-    return disturb(TRAIN, Path(folder), 20, seed=3)
-
-
 class TestSignals(BaseTester):
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize("shards", [(), ("--shard-items", "2")])
     def test_feature_rendering_stopped_by_signals_ends_with_the_same_bytes(self, shards, tmp_path):
         assert disturb((*RENDER, *shards), tmp_path, 2, seed=1) > 0
         assert contents(tmp_path / "stopped" / "out") == contents(tmp_path / "whole" / "out")
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("shards", [(), ("--shard-items", "2")])
-    def test_feature_rendering_stopped_at_twenty_moments(self, shards, tmp_path):
-        assert disturb((*RENDER, *shards), tmp_path, 20, seed=2) > 0
-        assert contents(tmp_path / "stopped" / "out") == contents(tmp_path / "whole" / "out")
-
-    @pytest.mark.slow
-    def test_feature_training_stopped_at_twenty_moments_ends_bit_for_bit_where_an_undisturbed_one_does(self, tmp_path):
-        pytest.importorskip("lightning.pytorch")
-        assert apart(stopped_trainings, str(tmp_path)) > 0
-        one, other = ((tmp_path / name / "out" / "last.safetensors").read_bytes() for name in ("whole", "stopped"))
-        assert one == other
 
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
     def test_feature_a_file_that_is_being_written_is_removed(self, number, tmp_path, monkeypatch):

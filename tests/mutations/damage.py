@@ -296,10 +296,3 @@ BY_KIND: dict[str, tuple[Damage, ...]] = {
     "npz": (),  # see tests.mutations.reading for its structure, and for that of OpenEXR
     "exr": (),
 }
-
-
-def damaged(data: bytes, kind: str, generator: Generator) -> tuple[str, bytes]:
-    """Return a description of a random damage and the damaged file; half of the damages are specific to the format."""
-    own = BY_KIND[kind]
-    damage: Damage = pick(generator, own) if own and generator.random() < 0.5 else pick(generator, BLIND)
-    return damage.__name__, damage(data, generator)

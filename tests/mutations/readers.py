@@ -42,7 +42,7 @@ from tests.data.published import write_nyu
 from tests.data.tiff_walk import cases as combinations
 from tests.data.tiff_walk import make as make_tiff
 from tests.lab.raw.dng import dng
-from tests.mutations.pristine import Case, make_cases
+from tests.mutations.pristine import Case, write_files
 from tests.optics.lens.written_files import WRITERS, doublet
 
 SHARES = {
@@ -66,9 +66,9 @@ KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "pam", "bmp", "webp"
 
 def make_readers(folder: Path) -> dict[str, list[Case]]:
     """Write whole files into an empty folder; return the readers of each kind of file."""
-    made = make_cases(folder)
-    cases = [*_pictures(made), *_tiffs(folder / "tiffs"), *_numbers(folder), *_systems(folder),
-             *_calibrations(folder / "calibrations"), *_folders(folder, made), *_runs(folder / "run"),
+    write_files(folder)
+    cases = [*_pictures(folder), *_tiffs(folder / "tiffs"), *_numbers(folder), *_systems(folder),
+             *_calibrations(folder / "calibrations"), *_folders(folder), *_runs(folder / "run"),
              *_raw_files(folder)]  # fmt: skip
     by_kind: dict[str, list[Case]] = {}
     for case in cases:
@@ -76,9 +76,8 @@ def make_readers(folder: Path) -> dict[str, list[Case]]:
     return by_kind
 
 
-def _pictures(made: dict[str, list[Case]]) -> list[Case]:
+def _pictures(folder: Path) -> list[Case]:
     """Pictures and depth maps in every format."""
-    folder = made["png"][0].source.parent
     rows = np.rint(255 * np.load(folder / "image.npy")).astype(np.uint8)
     for suffix in ("bmp", "webp", "ppm"):
         cv2.imwrite(str(folder / f"image.{suffix}"), rows)
@@ -167,9 +166,9 @@ def _numbers(folder: Path) -> list[Case]:
         Case("safetensors", "safetensors", folder / "camera.safetensors", load_camera),
         Case("safetensors", "safetensors", folder / "bank.safetensors", PSFBank.load),
         Case("safetensors", "safetensors", folder / "measured.safetensors", MeasuredPSFs.load),
-        Case("frames", "json", frames / "frames.json", read_frames, (), frames),
-        Case("frames", "npy", frames / "turns.npy", read_frames, (), frames),
-        Case("frames", "png", frames / "frame_000.png", read_frames, (), frames),
+        Case("frames", "json", frames / "frames.json", read_frames, frames),
+        Case("frames", "npy", frames / "turns.npy", read_frames, frames),
+        Case("frames", "png", frames / "frame_000.png", read_frames, frames),
         Case("response", "raw", folder / "lut.txt", read_levels),
         Case("response", "raw", folder / "columns.csv", read_levels),
     ]
@@ -185,8 +184,8 @@ def _systems(folder: Path) -> list[Case]:
     return [
         *(Case("checkpoint", "checkpoint", path, load_trained) for path in (plain, wrapped)),
         *(Case("state", "checkpoint", plain, read_state) for _ in range(2)),
-        Case("checkpoint", "json", hub / "config.json", _from_folder, (), hub),
-        Case("checkpoint", "safetensors", hub / "model.safetensors", _from_folder, (), hub),
+        Case("checkpoint", "json", hub / "config.json", _from_folder, hub),
+        Case("checkpoint", "safetensors", hub / "model.safetensors", _from_folder, hub),
         Case("run", "json", folder / "settings.json", SystemSettings.read),
         Case("weights", "raw", folder / "midas.pt", load_midas_small),
     ]  # fmt: skip
@@ -232,7 +231,7 @@ def _lenses(folder: Path) -> list[Case]:
     return [*cases, Case("lens", "safetensors", file, Lens.load)]
 
 
-def _folders(folder: Path, made: dict[str, list[Case]]) -> list[Case]:
+def _folders(folder: Path) -> list[Case]:
     """Data sets in folders."""
     rgbd, captures, shards = folder / "rgbd", folder / "captures", folder / "shards"
     optics, scenes = TiDyOptics(fidelity="draft"), DeadLeaves(2, 24, 24, num_leaves=20)
@@ -258,17 +257,17 @@ def _folders(folder: Path, made: dict[str, list[Case]]) -> list[Case]:
         return decode_sample({"scene.json": path.read_bytes(), "coded.npy": (folder / "depth.npy").read_bytes()})
 
     return [
-        Case("folder", "json", rgbd / "rgbd.json", lambda path: first(path, described_folder), (), rgbd),
-        Case("folder", "text", tum / "rgb.txt", lambda path: first(path, TUMSequence), (), tum),
-        *(Case("index", "text", place / "index.csv", lambda path: first(path, CodedCaptures), (), place)
+        Case("folder", "json", rgbd / "rgbd.json", lambda path: first(path, described_folder), rgbd),
+        Case("folder", "text", tum / "rgb.txt", lambda path: first(path, TUMSequence), tum),
+        *(Case("index", "text", place / "index.csv", lambda path: first(path, CodedCaptures), place)
           for place in (captures, shards)),
-        Case("index", "raw", shards / parts[0].name, lambda path: first(path, CodedCaptures), (), shards),
+        Case("index", "raw", shards / parts[0].name, lambda path: first(path, CodedCaptures), shards),
         Case("index", "tar", shards / parts[0].name, lambda path: encode_index(path.parent, parts, packed)),
         Case("index", "json", shards / "sample.json", sample),
-        Case("nyu", "hdf5", nyu / "nyu_depth_v2_labeled.mat", lambda path: NYUDepthV2(path.parent, "all")[0], (), nyu),
-        Case("nyu", "raw", nyu / "splits.mat", lambda path: first(path, NYUDepthV2), (), nyu),
+        Case("nyu", "hdf5", nyu / "nyu_depth_v2_labeled.mat", lambda path: NYUDepthV2(path.parent, "all")[0], nyu),
+        Case("nyu", "raw", nyu / "splits.mat", lambda path: first(path, NYUDepthV2), nyu),
         Case("npy", "npy", frozen / "000000.npy",
-             lambda path: NoiseFreeCaptures(scenes, optics, path.parent)[0], (), frozen),
+             lambda path: NoiseFreeCaptures(scenes, optics, path.parent)[0], frozen),
     ]  # fmt: skip
 
 
@@ -281,10 +280,10 @@ def _runs(folder: Path) -> list[Case]:
         '{"settings": {"data": "nyu"}, "split": "test", "scenes": 3, "mean": {"image_psnr": 20.5, "depth_rmse": 0.1}}'
     )
     return [
-        *(Case("run", damage, folder / name, lambda path: training_record(path.parent), (), folder)
+        *(Case("run", damage, folder / name, lambda path: training_record(path.parent), folder)
           for name, damage in (("validation.csv", "text"), ("evaluation.json", "json"))),
         Case("run", "text", folder / "training.csv", lambda path: drop_rows_after(path, 10)),
-        *(Case("figure", "text", folder / name, _draw, (), folder) for name in ("validation.csv", "training.csv")),
+        *(Case("figure", "text", folder / name, _draw, folder) for name in ("validation.csv", "training.csv")),
     ]  # fmt: skip
 
 

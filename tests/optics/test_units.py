@@ -79,11 +79,6 @@ class TestDepth(BaseTester):
             optics(*scene(900.0))
         assert len(told) == 1
 
-    def test_feature_a_large_picture_taken_in_bands_is_told_too(self):
-        optics = camera(memory_budget=1)
-        with pytest.warns(UserWarning, match="are these millimetres"), torch.no_grad():
-            optics(*scene(900.0, size=160))
-
     @pytest.mark.parametrize(
         ("depths", "options"),
         [
@@ -165,23 +160,6 @@ class TestDepthScale(BaseTester):
     def test_feature_far_scenes_are_no_mistake(self, read, stored, scale, tmp_path):
         found = read(stored.reshape(6, 8), scale, tmp_path).numpy()[0]
         np.testing.assert_allclose(found, stored.reshape(6, 8) * np.float64(scale), rtol=1e-6)
-
-    @pytest.mark.parametrize(
-        ("command", "output"),
-        [
-            ("simulate IN", "out.png"),
-            ("raw simulate --image IN", "out.dng"),
-            ("systems --image IN", "out.png"),
-            ("trade --image IN", "out"),
-        ],
-    )
-    def test_exception_each_command_refuses_it_in_a_line(self, command, output, tmp_path, capsys):
-        cv2.imwrite(str(tmp_path / "rgb.png"), np.full((80, 80, 3), 90, np.uint8))
-        cv2.imwrite(str(tmp_path / "depth.png"), np.full((80, 80), 1100, np.uint16))
-        words = [*command.replace("IN", str(tmp_path / "rgb.png")).split(), "--depth", str(tmp_path / "depth.png")]
-        assert main([*words, "--depth-scale", "1000", "-o", str(tmp_path / output)]) == 2
-        assert not (tmp_path / output).is_file()
-        assert "1000 units in a metre give 0.001, not 1000" in capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def saved(stored, folder):
@@ -306,17 +284,6 @@ class TestLens(BaseTester):
     def test_exception_types(self, options, said):
         with pytest.raises(TypeError, match=said):
             ThinLensCamera(**options)
-
-    @pytest.mark.parametrize(
-        "options",
-        [
-            {"focal_length": 2e-3, "aperture_diameter": 2e-3, "focus_distance": 4e-3},  # a microscope objective
-            {"focal_length": 3.9, "aperture_diameter": 0.28, "focus_distance": INF, "depth_range": (1e4, INF)},
-            {"focal_length": 4e-3, "aperture_diameter": 2e-3, "pixel_pitch": 0.56e-6},  # a mobile phone
-        ],
-    )
-    def test_feature_real_lenses_pass(self, options):
-        ThinLensCamera(**options)
 
     def test_exception_too_much_defocus_is_refused_before_any_work(self):
         wide = ThinLensCamera(aperture_diameter=50e-3)

@@ -18,7 +18,6 @@ from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, load_pretr
 from kornia_tidy.reconstruction.settings import RENAMED, SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.tasks import (
-    centre_crop,
     depth_logits,
     deviation_in_metres,
     metres,
@@ -76,13 +75,6 @@ class TestMovingAverage(BaseTester):
         self.assert_close(average.network.weight, expected, rtol=1e-6, atol=1e-6)
         assert not any(p.requires_grad for p in average.parameters())
 
-    def test_feature_statistics_are_copied(self):
-        network = nn.BatchNorm1d(2)
-        average = MovingAverage(network)
-        network(torch.randn(8, 2) + 3)
-        average.update(network)
-        assert torch.equal(average.network.running_mean, network.running_mean)
-
     def test_feature_buffers_that_stay_are_not_loaded_again(self):
         network, loaded = nn.BatchNorm1d(2), []
         average = MovingAverage(network)
@@ -106,22 +98,6 @@ class TestTasks(BaseTester):
         self.assert_close(normalised_inverse_depth(camera, depth), 0.3 / depth, atol=1e-6)
         assert normalised_inverse_depth(camera, torch.tensor([0.1]))[0] == 1
         self.assert_close(normalised_inverse_depth(DefocusRange(), torch.tensor([0.25])), torch.tensor([0.25]))
-
-    @pytest.mark.parametrize("name", LOSSES)
-    def test_feature_masked_pixels_have_no_part_in_loss_and_gradient(self, name):
-        prediction = torch.rand(2, 1, 12, 12, requires_grad=True)
-        target = torch.rand(2, 1, 12, 12)
-        mask = torch.rand(2, 1, 12, 12) > 0.3
-        target[~mask] = float("nan")
-        loss = task_loss(LOSSES[name], {"depth": prediction}, {"depth": target}, mask, {"depth": 1.0})
-        loss.backward()
-        kept = prediction.detach()[mask] - target[mask]
-        expected = {"mse": kept.square().mean(), "l1": kept.abs().mean()}
-        if name in expected:
-            self.assert_close(loss.detach(), expected[name])
-        assert loss.isfinite()
-        assert (prediction.grad[~mask] == 0).all()
-        assert (prediction.grad[mask] != 0).any()
 
     def test_feature_decibels_of_error_and_similarity_count_each_image_alike(self):
         truth = torch.rand(3, 3, 16, 16, dtype=torch.float64)
@@ -182,9 +158,6 @@ class TestTasks(BaseTester):
     def test_exception_a_head_of_other_channels_is_refused(self):
         with pytest.raises(ValueError, match=r"must return \(B, 1, H, W\)"):
             split_maps("depth", torch.rand(1, 3, 2, 2))
-
-    def test_feature_the_middle_is_cropped(self):
-        assert centre_crop(torch.arange(25).view(1, 5, 5), 3, 1).flatten().tolist() == [7, 12, 17]
 
 
 class TestSettings(BaseTester):

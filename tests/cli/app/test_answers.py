@@ -100,22 +100,6 @@ class TestLegends(BaseTester):
         assert f"RMSE {scores['depth_rmse']:.2f} of the range" in words["estimate"]
         assert f"{trained.optics.window} x {trained.optics.window} pixels" in words["psfs"]
 
-    def test_feature_a_plain_lens_shows_no_masks_in_turn(self, own):
-        words = legends(own)
-        assert "a lens without programmed masks" in words["capture"]
-        assert "by the network for any camera" in words["image"]
-        assert "adds up" not in words["psfs"]
-
-    @pytest.mark.parametrize(
-        ("camera", "words"),
-        [
-            ({"camera": "own", "start": "noise", "masks": 1}, "exposure through 1 mask; gather"),
-            ({"camera": "edof-flat"}, "through a lens without programmed masks; gather"),
-        ],
-    )
-    def test_feature_one_mask_is_not_shown_in_turn(self, camera, words):
-        assert words in legends(take_picture(Settings(**camera, **SMALL)))["capture"]
-
     def test_feature_many_pixels_beyond_the_range_are_told(self, trained):
         assert "beyond" not in status(trained, 1.0)
         far = take_picture(Settings(camera="ikoma2021", stretch=False, near=0.5, far=0.9, **SMALL))

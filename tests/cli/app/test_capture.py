@@ -13,11 +13,9 @@ from kornia_tidy.cli.app.scenes import chart
 from kornia_tidy.cli.app.script import as_python
 from kornia_tidy.cli.app.settings import CAMERAS, Settings
 from kornia_tidy.data import Scene, dead_leaves, read_depth, read_image, write_depth, write_image
-from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.tasks import metres
-from kornia_tidy.reconstruction.trained import closed_form_bank
 from tests.base import BaseTester
 
 SMALL = {"side": 96}
@@ -155,24 +153,6 @@ class TestScript(BaseTester):
 
 
 class TestBehindALens(BaseTester):
-    @pytest.mark.takes_seconds
-    @torch.no_grad()
-    def test_feature_the_corner_is_restored_by_the_psfs_of_the_corner(self):
-        """The network with the corner's PSFs: with those of the axis its picture is .1 of full scale from that."""
-        options = {"camera": "own", "start": "focal sweep", "masks": 5, "lens": "single-50mm", "side": 128}
-        result = take_picture(Settings(**options, place=1.0, noise=0.003))
-        assert result.optics.lens.name == "single-50mm"
-        assert result.optics.field_center == (543.0, 543.0)
-        system = any_camera_system(result.optics)
-        form = system.head.closed_form
-        axis, found = closed_form_bank(result.optics, form.layers), []
-        corner = result.optics.psf_bank(3, defocus=axis.defocus.tolist(), field=[(543.0, 543.0)])
-        for psfs in (axis.psfs, corner.psfs[0]):
-            form.set_psfs(dataclasses.replace(axis, psfs=psfs))
-            found.append(float((system.head(result.capture[None])[0] - result.image).abs().max()))
-        assert found[0] > 0.1
-        assert found[1] < 0.25 * found[0]  # over other depths than the app averages PSFs
-
     def test_exception_depths_that_the_lens_is_not_known_for(self):
         settings = Settings(camera="own", lens="single-50mm", near=0.45, far=0.6, f_number=8.0, focus_distance=1.5)
         with pytest.raises(ValueError, match=r"the lens 'single-50mm' is asked for a defocus of .*: choose another"):

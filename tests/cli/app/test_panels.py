@@ -11,7 +11,6 @@ import torch
 from kornia_tidy.cli.app import pictures
 from kornia_tidy.cli.app.answers import draw
 from kornia_tidy.cli.app.capture import own_camera, take_picture
-from kornia_tidy.cli.app.controls import UNITS
 from kornia_tidy.cli.app.legends import legends
 from kornia_tidy.cli.app.pictures import CELL, COLUMNS, GAP, HEAD, LEFT, MASK_SPACE, TITLE, mask_colors, psf_cell
 from kornia_tidy.cli.app.scenes import read_files
@@ -114,19 +113,6 @@ class TestDraw(BaseTester):
         assert [found[name].mean() for name in ("scene", "capture", "image")] == [153, 51, 102]
         assert found["depth"][:300].mean() < 20
         assert found["estimate"][:300].mean() > 200
-
-
-class TestUnits(BaseTester):
-    def test_feature_a_metre_in_each_unit(self):
-        """As published: millimetres in most sets, 5000 in TUM and ICL-NUIM, 256 in KITTI."""
-        metre = {label.split(" (")[0]: round(1 / scale, 9) for label, scale in UNITS}
-        assert metre == {
-            "metres": 1,
-            "centimetres": 100,
-            "millimetres": 1000,
-            "1/5000 metre": 5000,
-            "1/256 metre": 256,
-        }
 
 
 class TestFiles(BaseTester):

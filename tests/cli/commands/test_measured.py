@@ -11,7 +11,6 @@ import torch
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, read_image, read_rgbd, write_depth, write_image
-from kornia_tidy.lab.calibration.noise.photon_transfer import write_json
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs, measured_camera
 from kornia_tidy.lab.mask_export import write_heights
 from kornia_tidy.lab.measured import closed_form_system
@@ -84,16 +83,6 @@ class TestRawReconstruct(BaseTester):
         assert record["psfs"] == "measured: bank.safetensors"
         assert record["noise"] == sensor.extra_repr()
 
-    def test_feature_resume_knows_other_measurements(self, here, capsys):
-        command = ["raw", "reconstruct", "shot.dng", "--head", "tikhonov", *MEASURED, "-o", "sharp", "--resume"]
-        assert main(command) == 0
-        assert main(command) == 0
-        assert "kept" in capsys.readouterr().out
-        (here / "noise.json").unlink()
-        write_json(here / "noise.json", replace(measured_noise(), black=200.0))
-        assert main(command) == 0
-        assert "kept" not in capsys.readouterr().out
-
     def test_feature_a_network_is_told_and_pictures_are_taken_too(self, here):
         checkpoint(here / "mine.safetensors", task="edof", closed_form=True, **LENS)
         named = ["raw", "reconstruct", "shot.dng", "--head", "mine.safetensors"]
@@ -132,20 +121,6 @@ class TestCaptures(BaseTester):
         optics = measured_camera("bank.safetensors", sensor=measured_noise().sensor_noise())
         coded = optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(3))
         assert (read_image("coded.png") - coded).abs().max() <= 0.5 / 65535 + 1e-6
-
-    def test_feature_raw_simulate_too(self, here):
-        assert main(["raw", "simulate", "--image", "scene.png", *SCENE, *MEASURED, "-o", "again.dng"]) == 0
-        scene = read_rgbd("scene.png", "depth.png", scale=0.001)
-        raw = simulate_scene(
-            scene.image,
-            scene.depth,
-            measured_camera("bank.safetensors", sensor=None),
-            RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095),
-            measured_noise().sensor_noise(),
-            color="channels",
-            generator=torch.Generator().manual_seed(0),
-        )
-        assert torch.equal(RawCapture.open("again.dng").counts, raw.counts)
 
     def test_feature_masks_of_a_file(self, here):
         write_heights("masks.npy", HEIGHTS)

@@ -93,14 +93,6 @@ class TestPsf(BaseTester):
         assert main(["psf", "--lens", "single-50mm", *rest]) == 0
         assert rows(capsys.readouterr().out) != named
 
-    @pytest.mark.takes_seconds
-    def test_feature_a_file_of_surfaces_is_traced_at_the_f_number_and_focus_of_the_options(self, tmp_path, capsys):
-        (tmp_path / "lens.zmx").write_text(zemax(doublet()))
-        words = ["--f-number", "11", "--focus-distance", "1.8", "--depths", "1.8", "--fidelity", "draft"]
-        assert main(["psf", "--lens", str(tmp_path / "lens.zmx"), *words, "-o", str(tmp_path / "a.png")]) == 0
-        told = capsys.readouterr().out
-        assert "doublet: 100 mm f/11, focus at 1.8 m, field to 10.5 mm" in told
-
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [

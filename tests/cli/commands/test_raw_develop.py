@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data import image_files, read_image
+from kornia_tidy.data import read_image
 from kornia_tidy.lab.raw import RawCapture, develop
 from tests.base import BaseTester
 from tests.lab.raw.dng import dng, patched
@@ -105,23 +105,6 @@ class TestRawDevelop(BaseTester):
         assert (tmp_path / "c.png").exists()
         assert main(command[:-1]) == 0
         assert (tmp_path / "a.png").stat().st_mtime_ns != before
-
-    def test_feature_interrupted_leaves_whole_files_only(self, files, tmp_path, monkeypatch, capsys):
-        folder = tmp_path / "out"
-        write = image_files.write_image
-
-        def interrupted(path, *args, **options):
-            if path.name == "c.png":
-                raise KeyboardInterrupt
-            write(path, *args, **options)
-
-        monkeypatch.setattr(image_files, "write_image", interrupted)
-        assert main(["raw", "develop", files[0], files[2], files[3], "-o", str(folder)]) == 130
-        assert "1 developed, 0 kept, 2 failed or left" in capsys.readouterr().out
-        assert sorted(path.name for path in folder.iterdir()) == ["a.jpg", "a.png", "c.jpg"]
-        monkeypatch.undo()
-        assert main(["raw", "develop", files[0], files[2], files[3], "-o", str(folder), "--resume"]) == 0
-        assert "2 developed, 1 kept" in capsys.readouterr().out
 
     @pytest.mark.parametrize(
         ("extra", "message"),

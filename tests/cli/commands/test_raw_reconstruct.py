@@ -12,11 +12,9 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.cli.command_line import read_command
 from kornia_tidy.data import read_depth, read_image
 from kornia_tidy.figures import style
 from kornia_tidy.lab import capture_file
-from kornia_tidy.lab.capture_file import read_light
 from kornia_tidy.lab.raw import RawCapture, develop, simulate_raw
 from kornia_tidy.lab.raw.dng_file import encode_dng
 from kornia_tidy.lab.raw.tags import NOISE_PROFILE
@@ -26,7 +24,7 @@ from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.settings import TrainingSettings
-from tests.base import BaseTester, shared
+from tests.base import BaseTester
 from tests.lab.raw.dng import DOUBLE, dng
 
 ENDS = [".png", ".jpg", "_depth.png", "_depth.pfm", "_depth.npy", "_depth_colors.png", ".json"]
@@ -168,13 +166,6 @@ class TestRawReconstruct(BaseTester):
         assert "out of memory allocated 5 of 4 GiB\n" in capsys.readouterr().out
         assert {path.stem for path in folder.glob("*.json")} == {"a", "c"}
 
-    def test_feature_memory_does_not_change_results(self, batch):
-        files, weights, folder = batch
-        """Which share the memory, so that the tiles of one are as small; they differ from the whole by rounding."""
-        assert reconstruct(files, weights, folder, "--memory", "3") == 0
-        assert reconstruct(files, weights, folder.with_name("alone"), "--memory", "1") == 0
-        assert contents(folder) == contents(folder.with_name("alone"))
-
     @pytest.mark.takes_seconds
     def test_feature_interrupted_and_resumed_is_as_if_nothing_had_been(self, batch, monkeypatch, capsys):
         files, weights, folder = batch
@@ -221,14 +212,6 @@ class TestRawReconstruct(BaseTester):
         assert ("kept" in capsys.readouterr().out) == (change == "none")
         assert (folder / "a_depth.pfm").exists()
 
-    def test_feature_resume_does_not_keep_results_of_a_camera_with_more_options(self, tmp_path, capsys):
-        files, masks = [capture(tmp_path / "a.png", size=(40, 48))], tmp_path / "heights.npy"
-        np.save(masks, np.zeros((1, 23, 23), np.float32))
-        camera = ["--masks", str(masks), "--noise", "0.01", "--resume"]
-        for options, kept in ((["--f-number", "20"], False), ([], False), ([], True)):
-            assert reconstruct(files, "wiener", tmp_path / "out", *camera, *options) == 0
-            assert ("kept" in capsys.readouterr().out) == kept
-
     @pytest.mark.takes_seconds
     def test_feature_a_network_that_comes_with_the_library_needs_no_checkpoint(self, tmp_path, capsys):
         (tmp_path / "a.dng").write_bytes(raw_file())
@@ -237,19 +220,6 @@ class TestRawReconstruct(BaseTester):
         light = develop(RawCapture.open(tmp_path / "a.dng"), encoded=False, upright=False)
         image, *_ = reconstruct_light(LightHead(load_pretrained("edof-flat")), light)
         assert (read_image(tmp_path / "a.png") - image).abs().max() <= 0.5 / 65535 + 1e-6
-
-    def test_feature_dumps_are_developed_linearly(self, tmp_path):
-        """A grey mosaic of 25 % light: the network's input is 0.25 in all three colours, except near one dead pixel."""
-        counts = np.full((64, 80), 64 + 240, "<u2")
-        counts[0, 0] = 64
-        counts.tofile(tmp_path / "a.raw")
-        options = ["--size", "80x64", "--pattern", "GRBG", "--black", "64", "--white", "1024"]
-        dump = read_command(["raw", "reconstruct", "a.raw", "-o", "out", *options]).dump
-        light = read_light(tmp_path / "a.raw", raw=dump.open(str(tmp_path / "a.raw"))).light
-        assert light.shape == (3, 64, 80)
-        self.assert_close(light[:, 8:], torch.full((3, 56, 80), 0.25), atol=1e-3)
-        weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
-        assert reconstruct([str(tmp_path / "a.raw")], weights, tmp_path / "out", *options) == 0
 
     def test_feature_the_noise_of_a_raw_file_is_told_to_its_network(self, tmp_path, capsys):
         """By its noise profile, or as it is given; files of less noise get less of it taken away."""
@@ -272,15 +242,6 @@ class TestRawReconstruct(BaseTester):
         assert reconstruct(files, plain, tmp_path / "no", "--noise", "0.03") == 2
         assert "--noise is for a network that takes it" in capsys.readouterr().err
         assert reconstruct(files, system, tmp_path / "no", "--noise", "0") == 2
-
-    def test_feature_a_raw_file_keeps_camera_and_exposure(self, tmp_path):
-        image = pytest.importorskip("PIL.Image", reason="Pillow, which comes with matplotlib, is not installed")
-        weights = checkpoint(tmp_path / "edof.safetensors", task="edof")
-        files = [str(shared("data/raw/colinleroy+a2tools/QKTK_IMAGE01.QTK"))]
-        assert reconstruct(files, weights, tmp_path / "out", "--white-balance", "auto") == 0
-        for suffix in (".png", ".jpg"):
-            with image.open(tmp_path / "out" / f"QKTK_IMAGE01{suffix}") as picture:
-                assert picture.getexif()[0x010F] == "Apple"
 
     def test_exception_is_one_sentence_before_any_work(self, batch, capsys):
         files, weights, folder = batch

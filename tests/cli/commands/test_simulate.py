@@ -8,7 +8,7 @@ import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data import fill_holes, read_image, read_rgbd, write_depth, write_image
+from kornia_tidy.data import read_image, read_rgbd, write_depth
 from kornia_tidy.data.depth_range import middle_depths
 from kornia_tidy.optics import Lens
 from kornia_tidy.optics.lens import NAMED_LENSES
@@ -82,19 +82,6 @@ class TestSimulate(BaseTester):
         assert main(["simulate", "image.png", "--depth", "near.pfm", "-o", "out.png"]) == 0
         assert "(100 %) lie beyond the camera's range" in capsys.readouterr().out
 
-    def test_feature_holes_are_filled_where_it_is_asked_for(self, scene, capsys):
-        depth = read_rgbd("image.png", "depth.pfm").depth
-        depth[0, 20:30, 40:50] = 0
-        np.save("holes.npy", depth[0].numpy())
-        write_depth("filled.pfm", fill_holes(depth)[0])
-        assert main(["simulate", "image.png", "--depth", "holes.npy", "-o", "refused.png"]) == 2
-        assert "holes.npy has no depth at 100 of its 5760 pixels: take it from the nearest" in capsys.readouterr().err
-        assert not (scene / "refused.png").exists()
-        assert main(["simulate", "image.png", "--depth", "holes.npy", "--holes", "fill", "-o", "a.png"]) == 0
-        assert "1.7 % of it unknown and taken from the nearest known pixel" in capsys.readouterr().out
-        assert main(["simulate", "image.png", "--depth", "filled.pfm", "-o", "b.png"]) == 0
-        assert torch.equal(read_image("a.png"), read_image("b.png"))
-
     @pytest.mark.filterwarnings("always")
     @pytest.mark.parametrize("compositing", ["scatter", "occlusion"])
     def test_feature_every_option_reaches_the_camera(self, scene, capsys, compositing):
@@ -117,11 +104,6 @@ class TestSimulate(BaseTester):
                 color_space="linear",
             )(image, depth, generator=seeded(8))
         self.assert_close(read_image("out.png"), coded, rtol=0, atol=0.5 / 65535 + 1e-6)
-
-    def test_feature_grey_picture(self, scene):
-        write_image("grey.png", read_image("image.png")[:1])
-        assert main(["simulate", "grey.png", "--depth", "depth.pfm", "--fidelity", "draft"]) == 0
-        assert read_image("grey_coded.png").shape == (1, 72, 80)
 
     @pytest.mark.filterwarnings("always")
     def test_feature_fitted_camera_has_the_scene_in_its_range(self, scene, capsys):

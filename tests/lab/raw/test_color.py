@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy.lab.raw.color import (
-    ASSUMED_CAMERA,
     SRGB_FROM_XYZ,
-    assumed_camera_to_srgb,
     camera_to_srgb,
 )
 from tests.base import BaseTester
@@ -58,31 +56,3 @@ class TestCameraToSrgb(BaseTester):
         primaries.use_derived_matrix_XYZ_to_RGB = True
         assert np.abs(primaries.matrix_XYZ_to_RGB - np.array(SRGB_FROM_XYZ)).max() < 1.1e-3  # its white has 4 digits
         assert np.abs(np.array(SRGB_FROM_XYZ) @ D65 - 1).max() < 1e-6
-
-
-class TestAssumedCamera(BaseTester):
-    def test_feature_colorchecker_by_spectra(self):
-        """The chart in daylight through the measured sensitivities, against the same chart through the eye's.
-
-        Mean difference below 2.5 and the worst below 7 (CIE 2000), where the mean without a matrix is 6.8.
-        """
-        wavelengths = colour.SpectralShape(400, 700, 10)
-        light = colour.SDS_ILLUMINANTS["D65"].copy().align(wavelengths).values
-        camera = colour.MSDS_CAMERA_SENSITIVITIES[ASSUMED_CAMERA].copy().align(wavelengths).values
-        eye = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(wavelengths).values
-        chart = np.stack(
-            [sd.copy().align(wavelengths).values for sd in colour.SDS_COLOURCHECKERS["ColorChecker N Ohta"].values()]
-        )
-        balanced = (chart * light) @ camera / (light @ camera)
-        xyz = (chart * light) @ eye / (light @ eye)[1]
-        matrix, daylight = assumed_camera_to_srgb()
-        ratio = torch.as_tensor(1 / (light @ camera))
-        self.assert_close(daylight / daylight[1], ratio / ratio[1], rtol=1e-2)
-
-        inverse = np.linalg.inv(SRGB_FROM_XYZ)
-        true = colour.XYZ_to_Lab(xyz)
-        ours = colour.XYZ_to_Lab(balanced @ matrix.double().numpy().T @ inverse.T)
-        plain = colour.XYZ_to_Lab(balanced @ inverse.T)
-        assert colour.delta_E(true, ours).mean() < 2.5
-        assert colour.delta_E(true, ours).max() < 7
-        assert colour.delta_E(true, plain).mean() > 6

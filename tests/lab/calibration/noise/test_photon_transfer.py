@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 from scipy.ndimage import uniform_filter
 from scipy.optimize import curve_fit
 
-from kornia_tidy import SensorNoise
 from kornia_tidy.lab.calibration.noise import PhotonTransfer, photon_transfer
 from kornia_tidy.lab.calibration.noise.photon_transfer import TransferLine, fit_line, read_json, write_json
 from kornia_tidy.lab.calibration.noise.transfer_curve import CurvePoint
-from kornia_tidy.lab.raw import RawCapture, RawInfo, simulate_raw
+from kornia_tidy.lab.raw import RawCapture, RawInfo
 from tests.base import BaseTester, shared
 from tests.lab.calibration.noise.flats import flat, flats
 
@@ -164,20 +163,6 @@ class TestPhotonTransfer(BaseTester):
         assert result.line.fixed_pattern == pytest.approx(0.01, rel=0.2)
         assert set(result.channels) == set(pattern)
 
-    def test_feature_the_librarys_own_sensor_comes_back(self):
-        """SensorNoise -> counts -> photon transfer -> SensorNoise, in units of full scale."""
-        sensor = SensorNoise.physical(full_well=9000, read_noise_electrons=5.0, bits=12)
-        camera = RawCapture.from_counts(torch.zeros(1, 2, 2), "RGGB", 256, 4095, RawInfo("Acme", "One", iso=400.0))
-        generator = torch.Generator().manual_seed(0)
-        light = (0.85 * torch.linspace(0, 1, 16) ** 3).repeat_interleave(16).expand(3, 256, 256)
-        stack = [simulate_raw(light, camera, sensor, color="channels", generator=generator) for _ in range(4)]
-        result = photon_transfer(stack)
-        found = result.sensor_noise()
-        assert found.full_well == pytest.approx(9000, rel=0.03)
-        assert found.sigma == pytest.approx(5.0 / 9000, rel=0.05)
-        assert (found.bits, found.dark) == (12, 0.0)
-        assert (result.camera, result.iso) == ("Acme One", 400.0)
-
     @pytest.mark.parametrize(
         ("change", "message"),
         [
@@ -276,30 +261,6 @@ class TestFiles(BaseTester):
 
 
 class TestRealFiles(BaseTester):
-    @pytest.mark.parametrize(
-        "name",
-        [
-            "syoyo+tinydng/colorchart.dng",
-            "haraldk+TwelveMonkeys/dng_test.dng",
-        ],
-    )
-    def test_feature_a_straight_line_where_the_data_allow_it(self, name):
-        line = photon_transfer([RawCapture.open(shared(f"data/raw/{name}"))]).line
-        assert line.r_squared >= 0.99
-        assert line.gain_error < 0.02 * line.gain
-
-    def test_feature_read_noise_is_that_of_the_masked_border(self):
-        """The masked border of the G2 has a standard deviation of 0.79 counts, rounding included."""
-        import rawpy
-
-        path = shared("data/raw/thorsted+digicam_corpus/G2_CRW_0305.CRW")
-        with rawpy.imread(str(path)) as file:
-            border = file.raw_image[40:-40, -46:-4].astype(float)
-        result = photon_transfer([RawCapture.open(path)])
-        assert result.line.r_squared >= 0.99
-        expected = result.line.gain * math.sqrt(border.var() - 1 / 12)
-        assert result.line.read_noise == pytest.approx(expected, rel=0.1)
-
     @pytest.mark.parametrize(
         "name",
         [

@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from safetensors.torch import load_file, save_file
 
 from kornia_tidy import PixelwiseMask, PSFBank, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics
@@ -16,7 +14,6 @@ from kornia_tidy.lab.calibration.psf import (
     point_images,
 )
 from kornia_tidy.masks import fisher_mask
-from kornia_tidy.render import render
 from tests.base import BaseTester
 from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
 
@@ -153,17 +150,6 @@ class TestMeasurePSFs(BaseTester):
         with pytest.raises(ValueError, match=r"no point image at 0\.5 m can be used: .* leave the picture"):
             measure_psfs({0.5: [image]}, CAMERA, WINDOW)
 
-    @given(st.integers(-12, 12), st.integers(-12, 12))
-    @settings(max_examples=5)
-    def test_feature_where_the_point_lies_does_not_matter(self, down, right):
-        """Without noise, a point shifted by whole pixels gives the same image."""
-        fine = point_light(PixelwiseMask(1, initial=fisher_mask()), 4.0, SIDE, Spectrum.monochrome(), CAMERA)
-        light = torch.nn.functional.pad(on_pixels(fine, (2, -3)), (20, 20, 20, 20))
-        (one,) = point_images(light[None], torch.ones(1), SENSOR, WINDOW)
-        (other,) = point_images(torch.roll(light, (down, right), (1, 2))[None], torch.ones(1), SENSOR, WINDOW)
-        assert other.place == pytest.approx((one.place[0] + down, one.place[1] + right), abs=1e-3)
-        self.assert_close(other.light, one.light, rtol=0, atol=1e-5 * float(one.light.max()))
-
     @pytest.mark.slow
     def test_feature_a_mosaic_gives_the_psfs_on_the_pixels_of_the_sensor(self, coded, flat, truth):
         """Each plane has every second pixel; several positions of the point resolve the PSF, with both greens."""
@@ -238,16 +224,6 @@ class TestMeasuredPSFs(BaseTester):
             MeasuredPSFs.load(path)
         with pytest.raises(FileNotFoundError, match="no such file"):
             MeasuredPSFs.load(tmp_path / "none.safetensors")
-
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_a_camera_with_it_gives_the_image_of_the_renderer_called_directly(self, measured, compositing):
-        optics = TiDyOptics(camera=CAMERA, sensor=None, compositing=compositing, color_space="linear")
-        image, depth = torch.rand(1, 3, 48, 56), torch.full((1, 1, 48, 56), 0.62)
-        bank = measured.bank.with_tails() if compositing == "occlusion" else measured.bank  # some pixels are zero
-        wanted = render(image, CAMERA.defocus(depth), bank, compositing)
-        through = optics.with_bank(measured.bank)
-        self.assert_close(through(image, depth), wanted, atol=2e-5)
-        assert through.window == WINDOW
 
     def test_exception_other_channels_or_states(self, measured):
         optics = TiDyOptics(sensor=None).with_bank(measured.bank)
