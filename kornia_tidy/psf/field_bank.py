@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite
-from kornia_tidy.files import write_bytes
+from kornia_tidy.checks import check_finite
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
 from kornia_tidy.psf.measured_field import place_weights
-from kornia_tidy.psf.psf_bank import STRAY_LIGHT, PSFBank, bank_of_file
+from kornia_tidy.psf.psf_bank import BankOfPSFs, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
-from kornia_tidy.tensor_files import read_tensors
 
 _LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
-_FORMAT = "kornia_tidy.field_bank/1"
 FEWEST_CELLS = 23  # along a side of the stop, where they are alike
 
 
 @dataclass(frozen=True, eq=False)
-class FieldBank:
+class FieldBank(BankOfPSFs):
     """Point spread functions over field, defocus and colour.
 
     Args:
@@ -53,29 +48,13 @@ class FieldBank:
         (torch.Size([2, 1, 3]), 0.97)
     """
 
-    psfs: Tensor
-    defocus: Tensor
+    axes = ("F", "D", "C")
+    words, form = "PSF bank over the field", "kornia_tidy.field_bank/1"
+
     field: Tensor
     energy: Tensor
     light: Tensor
     veil: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        shape = tuple(self.psfs.shape)
-        if len(shape) != 5 or shape[3] != shape[4] or shape[3] % 2 == 0 or 0 in shape:
-            raise ValueError(f"psfs must have shape (F, D, C, P, P) with P odd, got {shape}")
-        if tuple(self.defocus.shape) != shape[1:2]:
-            raise ValueError(f"defocus must have shape ({shape[1]},) as psfs have, got {tuple(self.defocus.shape)}")
-        if tuple(self.field.shape) != (shape[0], 2):
-            raise ValueError(f"field must have shape ({shape[0]}, 2) as psfs have, got {tuple(self.field.shape)}")
-        for name, value in (("energy", self.energy), ("light", self.light)):
-            if tuple(value.shape) != shape[:3]:
-                raise ValueError(f"{name} must have shape {shape[:3]} as psfs have, got {tuple(value.shape)}")
-
-    @property
-    def window(self) -> int:
-        """Side P of the PSFs in pixels."""
-        return self.psfs.shape[-1]
 
     def at(self, index: int) -> PSFBank:
         """Return the bank of one point of the field; its PSFs keep the light that they have there."""
@@ -90,13 +69,7 @@ class FieldBank:
             pixel: row and column in the picture.
         """
         rows, columns = (field.along(axis, torch.tensor([float(pixel[axis])]))[0] for axis in (0, 1))
-        weights = (rows.T * columns).flatten()
-
-        def mixed(values: Tensor) -> Tensor:
-            return torch.tensordot(weights.to(values), values, 1)
-
-        veil = None if self.veil is None else mixed(self.veil)
-        return PSFBank(mixed(self.psfs), self.defocus, mixed(self.energy), veil)
+        return self._mixed((rows.T * columns).view(1, -1)).at(0)
 
     def at_places(self, places: Sequence[tuple[float, float]]) -> FieldBank:
         """Return measured PSFs at other points of the field, see :func:`~kornia_tidy.psf.measured_field.place_weights`.
@@ -104,56 +77,14 @@ class FieldBank:
         Args:
             places: (y, x) in sensor pixels from the axis.
         """
-        weights = place_weights(self.field, places)
+        return self._mixed(
+            place_weights(self.field, places), field=self.field.new_tensor([list(own) for own in places])
+        )
 
-        def mixed(values: Tensor) -> Tensor:
-            return torch.tensordot(weights.to(values), values, 1)
-
-        veil = None if self.veil is None else mixed(self.veil)
-        there = self.field.new_tensor([list(place) for place in places])
-        return FieldBank(mixed(self.psfs), self.defocus, there, mixed(self.energy), mixed(self.light), veil)
-
-    def at_defocus(self, defocus: Sequence[float]) -> FieldBank:
-        """Return the PSFs at other defocus, mixed linearly, see :meth:`~kornia_tidy.psf.PSFBank.at_defocus`."""
-        mixed = [self.at(index).at_defocus(defocus) for index in range(len(self.psfs))]
-        shares = [PSFBank(p[..., None, None], self.defocus, p).at_defocus(defocus).energy for p in self.light]
-        psfs, energy = (torch.stack([getattr(bank, name) for bank in mixed]) for name in ("psfs", "energy"))
-        return FieldBank(psfs, mixed[0].defocus, self.field, energy, torch.stack(shares))
-
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> FieldBank:
-        """Return the bank on a device and in a data type; None: unchanged."""
-        present = {name: value for name, value in vars(self).items() if value is not None}
-        return FieldBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
-
-    def with_tails(self) -> FieldBank:
-        """Return a bank with PSFs that are zero nowhere, see :meth:`~kornia_tidy.psf.PSFBank.with_tails`."""
-        places = len(self.psfs)
-        flat = PSFBank(self.psfs.flatten(0, 1), self.defocus.repeat(places), self.energy.flatten(0, 1))
-        return replace(self, psfs=flat.with_tails().psfs.unflatten(0, (places, -1)))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the bank as safetensors, all or nothing.
-
-        Raises:
-            FileNotFoundError: if the folder does not exist.
-        """
-        present = {k: v.detach().cpu().contiguous() for k, v in vars(self).items() if v is not None}
-        write_bytes(path, save(present, metadata={"format": _FORMAT}))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> FieldBank:
-        """Read a bank written by :meth:`save`.
-
-        Raises:
-            FileNotFoundError: if the file is missing.
-            ValueError: if the file is not such a bank, or a value is NaN or infinite.
-        """
-        tensors, notes = read_tensors(path, "PSF bank over the field", device)
-        needed = {"psfs", "defocus", "field", "energy", "light"}
-        if notes.get("format") != _FORMAT or not needed <= set(tensors) <= {*needed, "veil"}:
-            found = f"{notes.get('format')!r:.40} with {sorted(tensors)!r:.200}"
-            raise ValueError(f"{path} is not a PSF bank over the field: its format is {found}")
-        return bank_of_file(cls, tensors, path)
+    def _mixed(self, weights: Tensor, **rest: Tensor) -> FieldBank:
+        """Return the bank at n places, by the weights (n, F) there of those that it holds."""
+        held = {k: value for k, value in self.present().items() if k != "defocus" and k not in rest}
+        return replace(self, **{k: torch.tensordot(weights.to(value), value, 1) for k, value in held.items()}, **rest)
 
     @classmethod
     def from_measured(
@@ -196,20 +127,6 @@ class FieldBank:
         psfs = torch.stack([bank.psfs for bank in banks]) * there[..., None, None]
         energy, points = torch.stack([bank.energy for bank in banks]), first.psfs.new_tensor(places)
         return cls(psfs, first.defocus, points, energy, there)
-
-    def with_stray_light(self, kind: str) -> FieldBank:
-        """Return a bank in which the light outside the window is dealt with.
-
-        Args:
-            kind: ``"renormalize"`` scales each PSF to the light of its point; ``"veil"`` keeps the PSFs and spreads the
-                missing light over the image; ``"discard"`` loses it.
-        """
-        check_choice("stray_light", kind, STRAY_LIGHT)
-        if kind == "renormalize":
-            return replace(
-                self, psfs=self.psfs / self.energy.clamp(min=torch.finfo(self.energy.dtype).tiny)[..., None, None]
-            )
-        return replace(self, veil=(1 - self.energy).clamp(min=0) * self.light if kind == "veil" else None)
 
     def with_all_light(self) -> FieldBank:
         """Return a bank with PSFs that sum to ``light``, whatever was done about light outside the window."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, Self
 
 import torch
 from safetensors.torch import save
@@ -15,88 +15,76 @@ from kornia_tidy.checks import check_choice, check_finite, check_values
 from kornia_tidy.files import write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
-T = TypeVar("T")
-
 STRAY_LIGHT = ("renormalize", "veil", "discard")
-TAILS = 1e-3  # of a PSF's light, see PSFBank.with_tails
-_FORMAT = "kornia_tidy.psf_bank/1"
-_FIELDS = ("psfs", "defocus", "energy", "veil")
+TAILS = 1e-3  # of a PSF's light, see BankOfPSFs.with_tails
 
 
 @dataclass(frozen=True, eq=False)
-class PSFBank:
-    """Point spread functions over defocus and colour.
+class BankOfPSFs:
+    """What banks at one place and over the field share: PSFs (..., D, C, P, P), and values (..., D, C) of each."""
 
-    Args:
-        psfs: (D, C, P, P), the share of a point's light in each pixel; P is odd and the centre is the chief ray.
-        defocus: (D,) ascending nodes in radians at the pupil edge at 530 nm.
-        energy: (D, C) share of the light inside the window, before anything is done about the rest.
-        veil: (D, C) share of the light that is spread evenly over the image, or None.
-
-    Raises:
-        ValueError: if the shapes do not fit each other or the nodes do not ascend.
-
-    Example:
-        >>> bank = PSFBank(torch.ones(2, 3, 1, 1), torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
-        >>> bank.window, bank.psfs.dtype
-        (1, torch.float32)
-    """
+    axes: ClassVar[tuple[str, ...]]  # of the values of each PSF
+    words: ClassVar[str]  # what a file of them is called
+    form: ClassVar[str]  # and how it names its format
 
     psfs: Tensor
     defocus: Tensor
-    energy: Tensor
-    veil: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = tuple(self.psfs.shape)
-        if len(shape) != 4 or shape[2] != shape[3] or shape[2] % 2 == 0 or 0 in shape:
-            raise ValueError(f"psfs must have shape (D, C, P, P) with P odd, got {shape}")
-        if tuple(self.defocus.shape) != shape[:1]:
-            raise ValueError(f"defocus must have shape ({shape[0]},) as psfs have, got {tuple(self.defocus.shape)}")
-        for name, value in (("energy", self.energy), ("veil", self.veil)):
-            if value is not None and tuple(value.shape) != shape[:2]:
-                raise ValueError(f"{name} must have shape {shape[:2]} as psfs have, got {tuple(value.shape)}")
+        if len(shape) != len(self.axes) + 2 or shape[-2] != shape[-1] or shape[-1] % 2 == 0 or 0 in shape:
+            raise ValueError(f"psfs must have shape ({', '.join(self.axes)}, P, P) with P odd, got {shape}")
+        wanted = {"psfs": shape, "defocus": shape[-4:-3], "field": (shape[0], 2)}
+        for part in fields(self):
+            name, value = part.name, getattr(self, part.name)
+            if value is not None and tuple(value.shape) != (own := wanted.get(name, shape[:-2])):
+                raise ValueError(f"{name} must have shape {own} as psfs have, got {tuple(value.shape)}")
+
+    def present(self) -> dict[str, Tensor]:
+        """Return the tensors by their names."""
+        return {part.name: value for part in fields(self) if (value := getattr(self, part.name)) is not None}
 
     @property
     def window(self) -> int:
         """Side P of the PSFs in pixels."""
         return self.psfs.shape[-1]
 
-    def with_stray_light(self, kind: str, basis: int = 1) -> PSFBank:
+    def with_stray_light(self, kind: str, basis: int = 1) -> Self:
         """Return a bank in which the light outside the window is dealt with.
 
         Args:
-            kind: ``"renormalize"`` scales each PSF to a sum of one; ``"veil"`` keeps the PSFs and spreads the missing
-                light over the image; ``"discard"`` loses it.
+            kind: ``"renormalize"`` scales each PSF to the light of its point, a sum of one on the axis; ``"veil"``
+                keeps the PSFs and spreads the missing light over the image; ``"discard"`` loses it.
             basis: PSFs a channel, see :class:`~kornia_tidy.optics.spectrum.Spectrum`.
         """
         check_choice("stray_light", kind, STRAY_LIGHT)
+        bank: Any = self
         if basis > 1:
-            return self._with_stray_light_of_basis(kind, basis)
+            return self._with_stray_light_of_basis(bank.energy, kind, basis)
         if kind == "renormalize":
-            tiny = torch.finfo(self.energy.dtype).tiny  # a PSF without light stays without light
-            return PSFBank(self.psfs / self.energy.clamp(min=tiny)[..., None, None], self.defocus, self.energy)
-        veil = (1 - self.energy).clamp(min=0) if kind == "veil" else None
-        return PSFBank(self.psfs, self.defocus, self.energy, veil)
+            tiny = torch.finfo(bank.energy.dtype).tiny  # a PSF without light stays without light
+            return replace(self, psfs=self.psfs / bank.energy.clamp(min=tiny)[..., None, None], veil=None)
+        lost = (1 - bank.energy).clamp(min=0) * getattr(self, "light", 1)
+        return replace(self, veil=lost if kind == "veil" else None)
 
-    def _with_stray_light_of_basis(self, kind: str, basis: int) -> PSFBank:
+    def _with_stray_light_of_basis(self, energy: Tensor, kind: str, basis: int) -> Self:
         """Return the bank of a spectral scene with its stray light; white and uniform colours keep their values.
 
         A channel collects all light of its reflectance and no other. The window's share of the light differs between
         them, as between wavelengths; "renormalize" makes it up in the shape of the channel's PSF for white light.
         """
-        seen = torch.eye(basis).to(self.energy)  # (C, B), as many channels as reflectances, at each point of a field
-        seen = seen.repeat(self.energy.shape[1] // basis**2, 1)
-        energy = self.energy.unflatten(1, (-1, basis))
+        seen = torch.eye(basis).to(energy)  # (C, B), as many channels as reflectances, at each point of a field
+        seen = seen.repeat(energy.shape[1] // basis**2, 1)
+        energy = energy.unflatten(1, (-1, basis))
         if kind != "renormalize":
-            return PSFBank(self.psfs, self.defocus, self.energy, (seen - energy).flatten(1) if kind == "veil" else None)
+            return replace(self, veil=(seen - energy).flatten(1) if kind == "veil" else None)
         white = energy.sum(2, keepdim=True).clamp(min=torch.finfo(energy.dtype).tiny)[..., None, None]
         psfs = self.psfs.unflatten(1, (-1, basis)) / white
         missing = seen[..., None, None] - energy[..., None, None] / white
         psfs = psfs + missing * psfs.sum(2, keepdim=True)
-        return PSFBank(psfs.flatten(1, 2), self.defocus, self.energy)
+        return replace(self, psfs=psfs.flatten(1, 2), veil=None)
 
-    def with_tails(self) -> PSFBank:
+    def with_tails(self) -> Self:
         r"""Return a bank with PSFs that are zero nowhere: a thousandth of their light follows :math:`1 / (1 + r^2)`.
 
         Occlusion looks behind near things through the tails of the far layers' PSFs. Where those are cut to zero it
@@ -115,16 +103,14 @@ class PSFBank:
         """
         offset = torch.arange(self.window, device=self.psfs.device, dtype=self.psfs.dtype) - self.window // 2
         tails = 1 / (1 + offset[:, None] ** 2 + offset**2)
-        light = self.psfs.sum((2, 3), keepdim=True)
-        psfs = (1 - TAILS) * self.psfs + TAILS * light * (tails / tails.sum())
-        return PSFBank(psfs, self.defocus, self.energy, self.veil)
+        light = self.psfs.sum((-2, -1), keepdim=True)
+        return replace(self, psfs=(1 - TAILS) * self.psfs + TAILS * light * (tails / tails.sum()))
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> PSFBank:
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """Return the bank on a device and in a data type; None: unchanged."""
-        present = {name: value for name in _FIELDS if (value := getattr(self, name)) is not None}
-        return PSFBank(**{name: value.to(device, dtype or value.dtype) for name, value in present.items()})
+        return type(self)(**{k: value.to(device, dtype or value.dtype) for k, value in self.present().items()})
 
-    def at_defocus(self, defocus: Sequence[float]) -> PSFBank:
+    def at_defocus(self, defocus: Sequence[float]) -> Self:
         """Return the PSFs at other defocus, as a capture through linear layers has them.
 
         Between two nodes they are mixed linearly. Beyond the first and the last node they are those of that node.
@@ -138,37 +124,18 @@ class PSFBank:
             tensor([0.0000, 0.7500, 1.0000])
         """
         wanted = torch.as_tensor(defocus, dtype=torch.float64, device=self.defocus.device)
-        nodes = self.defocus.double()
+        nodes, depths = self.defocus.double(), len(self.axes) - 2
         upper = torch.searchsorted(nodes, wanted).clamp(1, max(len(nodes) - 1, 1)).clamp(max=len(nodes) - 1)
         lower = (upper - 1).clamp(min=0)
         span = (nodes[upper] - nodes[lower]).clamp(min=torch.finfo(torch.float64).tiny)
         share = ((wanted - nodes[lower]) / span).clamp(0, 1)
 
         def mixed(values: Tensor) -> Tensor:
-            weight = share.to(values).view(-1, *[1] * (values.ndim - 1))
-            return torch.lerp(values[lower], values[upper], weight)
+            below, above = (values.index_select(depths, own) for own in (lower, upper))
+            return torch.lerp(below, above, share.to(values).view(-1, *[1] * (values.ndim - depths - 1)))
 
-        veil = None if self.veil is None else mixed(self.veil)
-        return PSFBank(mixed(self.psfs), wanted.to(self.defocus), mixed(self.energy), veil)
-
-    def with_channels(self, channels: int) -> PSFBank:
-        """Return the PSFs of one channel for three colours, or green of three for one channel.
-
-        Args:
-            channels: 1 or 3.
-
-        Raises:
-            ValueError: if they are of another number of channels, or another one is asked for.
-
-        Example:
-            >>> PSFBank.from_measured(torch.rand(2, 1, 5, 5), torch.arange(2.0)).with_channels(3).psfs.shape
-            torch.Size([2, 3, 5, 5])
-        """
-        chosen = {(1, 3): [0, 0, 0], (3, 1): [1]}.get((own := self.psfs.shape[1], channels), list(range(own)))
-        if len(chosen) != channels:
-            raise ValueError(f"PSFs of {channels} channels are needed, got {own}")
-        veil = None if self.veil is None else self.veil[:, chosen]
-        return PSFBank(self.psfs[:, chosen], self.defocus, self.energy[:, chosen], veil)
+        kept = {k: mixed(value) for k, value in self.present().items() if k not in ("defocus", "field")}
+        return replace(self, defocus=wanted.to(self.defocus), **kept)
 
     def save(
         self,
@@ -186,23 +153,72 @@ class PSFBank:
         Raises:
             FileNotFoundError: if the folder does not exist.
         """
-        tensors = {**{name: getattr(self, name) for name in _FIELDS}, **(more or {})}
-        present = {k: v.detach().cpu().contiguous() for k, v in tensors.items() if v is not None}
-        write_bytes(path, save(present, metadata={**(notes or {}), "format": _FORMAT}))
+        tensors = {k: v.detach().cpu().contiguous() for k, v in {**self.present(), **(more or {})}.items()}
+        write_bytes(path, save(tensors, metadata={**(notes or {}), "format": self.form}))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> PSFBank:
+    def load(cls, path: str | os.PathLike[str], device: torch.device | str = "cpu") -> Self:
         """Read a bank written by :meth:`save`.
 
         Raises:
             FileNotFoundError: if the file is missing.
-            ValueError: if the file is not a PSF bank, or a value is NaN or infinite.
+            ValueError: if the file is not such a bank, or a value is NaN or infinite.
         """
-        stored, notes = read_tensors(path, "PSF bank", device)
-        form, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
-        if form != _FORMAT or not {"psfs", "defocus", "energy"} <= set(tensors) <= {*_FIELDS}:
-            raise ValueError(f"{path} is not a PSF bank: its format is {form!r:.40} with {sorted(tensors)!r:.200}")
-        return bank_of_file(cls, tensors, path)
+        stored, notes = read_tensors(path, cls.words, device)
+        found, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
+        names = {part.name for part in fields(cls)}
+        if found != cls.form or not names - {"veil"} <= set(tensors) <= names:
+            raise ValueError(f"{path} is not a {cls.words}: its format is {found!r:.40} with {sorted(tensors)!r:.200}")
+        for name, value in tensors.items():
+            check_finite(f"{name} of {path}", value)
+        try:
+            return cls(**tensors)
+        except ValueError as error:
+            raise ValueError(f"cannot read {path}: {error}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class PSFBank(BankOfPSFs):
+    """Point spread functions over defocus and colour.
+
+    Args:
+        psfs: (D, C, P, P), the share of a point's light in each pixel; P is odd and the centre is the chief ray.
+        defocus: (D,) ascending nodes in radians at the pupil edge at 530 nm.
+        energy: (D, C) share of the light inside the window, before anything is done about the rest.
+        veil: (D, C) share of the light that is spread evenly over the image, or None.
+
+    Raises:
+        ValueError: if the shapes do not fit each other or the nodes do not ascend.
+
+    Example:
+        >>> bank = PSFBank(torch.ones(2, 3, 1, 1), torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
+        >>> bank.window, bank.psfs.dtype
+        (1, torch.float32)
+    """
+
+    axes = ("D", "C")
+    words, form = "PSF bank", "kornia_tidy.psf_bank/1"
+
+    energy: Tensor
+    veil: Tensor | None = None
+
+    def with_channels(self, channels: int) -> PSFBank:
+        """Return the PSFs of one channel for three colours, or green of three for one channel.
+
+        Args:
+            channels: 1 or 3.
+
+        Raises:
+            ValueError: if they are of another number of channels, or another one is asked for.
+
+        Example:
+            >>> PSFBank.from_measured(torch.rand(2, 1, 5, 5), torch.arange(2.0)).with_channels(3).psfs.shape
+            torch.Size([2, 3, 5, 5])
+        """
+        chosen = {(1, 3): [0, 0, 0], (3, 1): [1]}.get((own := self.psfs.shape[1], channels), list(range(own)))
+        if len(chosen) != channels:
+            raise ValueError(f"PSFs of {channels} channels are needed, got {own}")
+        return replace(self, **{k: value[:, chosen] for k, value in self.present().items() if k != "defocus"})
 
     @classmethod
     def from_measured(cls, psfs: Tensor, defocus: Tensor) -> PSFBank:
@@ -249,22 +265,3 @@ def enclosing_window(psfs: Tensor, share: float) -> int | None:
     rings = psfs.new_zeros(*psfs.shape[:-2], size // 2 + 1).index_add(-1, ring, psfs.flatten(-2))
     held = rings.cumsum(-1).reshape(-1, size // 2 + 1).amin(0) >= share
     return 2 * int(held.long().argmax()) + 1 if bool(held.any()) else None
-
-
-def bank_of_file(kind: Callable[..., T], tensors: Mapping[str, Tensor], path: str | os.PathLike[str]) -> T:
-    """Return a bank of the tensors of a file.
-
-    Args:
-        kind: class of the bank.
-        tensors: its parts by their names.
-        path: of the file, for the message.
-
-    Raises:
-        ValueError: if a value is NaN or infinite, or the parts do not fit.
-    """
-    for name, value in tensors.items():
-        check_finite(f"{name} of {path}", value)
-    try:
-        return kind(**tensors)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
