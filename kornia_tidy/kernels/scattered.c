@@ -1,5 +1,5 @@
 // Light in the pixels of a sensor from scattered points in the stop of a lens, averaged over the states of an exposure,
-// and the gradients of the states' waves and weights. The formulas are in scattered_ops.py.
+// for several exposures, and the gradients of the states' waves and weights. The formulas are in scattered_ops.py.
 //
 // For each depth the points of a patch, which share a wave, are spread on a patch of the grid. This is added to the grid
 // of each state, times the state's wave. Rows of a grid are transformed by real matrices as sums and differences of
@@ -21,16 +21,16 @@ enum { NO_MEMORY = 1, OUTSIDE = 2 };                 // status of the functions
 
 // The fields of `_Scattered` in scattered_ops.py.
 typedef struct {
-    int64_t places, depths, states, cells, patches, points, phases, amplitudes, width, degree, extent, samples, shifts, window,
-        threads;
+    int64_t places, depths, exposures, states, cells, patches, points, phases, amplitudes, width, degree, extent, samples,
+        shifts, window, threads;
     const int64_t *cell;                          // (patches,)
     const double *values;                         // (places, 2 + phases + amplitudes, patches, points)
     const double *phase_terms, *amplitude_terms;  // (depths, phases), (depths, amplitudes)
     const REAL *kernel;                           // (degree + 1,)
-    const REAL *waves, *weights;                  // (states, cells) complex, (states,)
+    const REAL *waves, *weights;                  // (exposures, states, cells) complex, (states,)
     const REAL *cosines, *sines;                  // (samples / 2, extent / 2)
-    const REAL *rows, *columns;                   // (places, shifts, window, samples)
-    const REAL *gradient;                         // (places, depths, shifts, window, window); not for light
+    const REAL *rows, *columns;                   // (places, exposures, shifts, window, samples)
+    const REAL *gradient;                         // (places, depths, exposures, shifts, window, window); not for light
     REAL *light;                                  // like gradient
     REAL *of_waves, *of_weights;                  // gradients: like waves and weights, zeros
 } scattered;
@@ -116,7 +116,7 @@ typedef struct {
     REAL *row_weights;                // (patches, points, rows)
     vec *column_weights;              // (patches, points, vecs), each number twice
     matrix cosines, sines, cosines_back, sines_back;
-    matrix *pixels;                   // (shifts, 4): columns, rows, and the transposes
+    matrix *pixels;                   // (exposures, shifts, 4): columns, rows, and the transposes
     int64_t size;                     // vectors of a desk
     vec *desks;                       // (threads, size)
 } work;
@@ -252,7 +252,7 @@ static void spread(const work *w, const REAL *field, int64_t c, vec *patch, vec 
 // What a thread computes a depth in. Numbers of rows are padded to whole blocks where they come from a product.
 typedef struct {
     REAL *field;         // (patches, points) complex
-    vec *grids;          // (states, extent, across)
+    vec *grids;          // (exposures, states, extent, across)
     vec *patch, *turned; // (rows, vecs)
     vec *sum, *less;     // (extent / 2, across or along): of mirrored rows, and their difference times -i
     vec *even, *odd;     // (samples / 2, across or along): their transforms
@@ -275,13 +275,12 @@ INLINE void add_patch(const vec *patch, const vec *turned, int64_t tall, int64_t
 static void fill_grids(const work *w, const desk *d) {
     const scattered *s = w->s;
     const int64_t tall = w->tall, vecs = w->vecs, pitch = w->across * LANES, size = s->extent * pitch;
-    memset(d->grids, 0, s->states * size * sizeof(REAL));
-    memset(d->light, 0, s->samples * w->along * sizeof(vec));
+    memset(d->grids, 0, s->exposures * s->states * size * sizeof(REAL));
     for (int64_t c = 0; c < s->patches; c++) {
         spread(w, d->field, c, d->patch, d->turned);
         REAL *at = (REAL *)d->grids + w->start[2 * c] * pitch + 2 * w->start[2 * c + 1];
         const REAL *wave = s->waves + 2 * s->cell[c];
-        for (int64_t k = 0; k < s->states; k++, at += size, wave += 2 * s->cells) {
+        for (int64_t k = 0; k < s->exposures * s->states; k++, at += size, wave += 2 * s->cells) {
             if (vecs == 1) add_patch(d->patch, d->turned, tall, 1, wave[0], wave[1], at, pitch);
             else if (vecs == 2) add_patch(d->patch, d->turned, tall, 2, wave[0], wave[1], at, pitch);
             else add_patch(d->patch, d->turned, tall, vecs, wave[0], wave[1], at, pitch);
@@ -355,33 +354,33 @@ static void add_light(const work *w, REAL weight, const desk *d) {
         }
 }
 
-static void sum_pixels(const work *w, const desk *d, REAL *out) {
+static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL *out) {
     const int64_t window = w->s->window;
     for (int64_t v = 0; v < w->s->shifts; v++, out += window * window) {
-        multiply(w->pixels + 4 * v, d->light, w->along, d->lines);
+        multiply(pixels + 4 * v, d->light, w->along, d->lines);
         for (int64_t p = 0; p < window; p++) {
             const REAL *line = (const REAL *)(d->lines + p * w->along);
             for (int64_t y = 0; y < w->s->samples; y++)
                 ((REAL *)(d->turned_lines + y * w->beside))[p] = line[2 * y] + line[2 * y + 1];
         }
-        multiply(w->pixels + 4 * v + 1, d->turned_lines, w->beside, d->pixels);
+        multiply(pixels + 4 * v + 1, d->turned_lines, w->beside, d->pixels);
         for (int64_t q = 0; q < window; q++) memcpy(out + q * window, d->pixels + q * w->beside, window * sizeof(REAL));
     }
 }
 
 // The transpose of it, to the gradient of the light.
-static void spread_pixels(const work *w, const desk *d, const REAL *gradient) {
+static void spread_pixels(const work *w, const matrix *pixels, const desk *d, const REAL *gradient) {
     const int64_t window = w->s->window, size = w->s->samples * w->along;
     memset(d->of_light, 0, size * sizeof(vec));
     for (int64_t v = 0; v < w->s->shifts; v++) {
         for (int64_t q = 0; q < window; q++, gradient += window) memcpy(d->pixels + q * w->beside, gradient, window * sizeof(REAL));
-        multiply(w->pixels + 4 * v + 3, d->pixels, w->beside, d->turned_lines);
+        multiply(pixels + 4 * v + 3, d->pixels, w->beside, d->turned_lines);
         for (int64_t p = 0; p < window; p++) {
             REAL *line = (REAL *)(d->lines + p * w->along);
             for (int64_t y = 0; y < w->s->samples; y++)
                 line[2 * y] = line[2 * y + 1] = ((const REAL *)(d->turned_lines + y * w->beside))[p];
         }
-        multiply(w->pixels + 4 * v + 2, d->lines, w->along, d->light);
+        multiply(pixels + 4 * v + 2, d->lines, w->along, d->light);
         for (int64_t n = 0; n < size; n++) d->of_light[n] += d->light[n];
     }
 }
@@ -400,12 +399,12 @@ static REAL light_gradient(const work *w, REAL weight, const desk *d) {
     return sum_of(total);
 }
 
-// The gradient of waves, (states, cells) complex, from those of the grids.
+// The gradient of waves, (exposures, states, cells) complex, from those of the grids.
 static void gather_waves(const work *w, const desk *d, REAL *of_waves) {
     const scattered *s = w->s;
     for (int64_t c = 0; c < s->patches; c++) {
         spread(w, d->field, c, d->patch, d->turned);
-        for (int64_t k = 0; k < s->states; k++) {
+        for (int64_t k = 0; k < s->exposures * s->states; k++) {
             const REAL *at = (const REAL *)grid_row(w, d->grids, k * s->extent + w->start[2 * c]) + 2 * w->start[2 * c + 1];
             vec re = {0}, im = {0};
             for (int64_t r = 0; r < w->tall; r++, at += w->across * LANES)
@@ -425,7 +424,7 @@ static int64_t share_out(const work *w, vec *memory, desk *d) {
     const int64_t wide = w->across > w->along ? w->across : w->along, half = padded(s->extent / 2, BLOCK) * wide,
                   samples = padded(s->samples, BLOCK), transformed = padded(s->samples / 2, BLOCK) * wide;
     const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
-                             s->states * s->extent * w->across,
+                             s->exposures * s->states * s->extent * w->across,
                              w->rows * w->vecs,
                              w->rows * w->vecs,
                              half,
@@ -450,22 +449,26 @@ static int64_t share_out(const work *w, vec *memory, desk *d) {
 static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, REAL *of_weights) {
     const scattered *s = w->s;
     desk own, *d = &own;
-    const int64_t out = (place * s->depths + depth) * s->shifts * s->window * s->window;
+    const int64_t size = s->shifts * s->window * s->window, out = (place * s->depths + depth) * s->exposures * size;
     share_out(w, w->desks + thread_number() * w->size, d);
     const int64_t rows = 2 + s->phases + s->amplitudes;
     fill_field(s, s->values + (place * rows + 2) * s->patches * s->points, depth, d->field);
     fill_grids(w, d);
-    if (s->gradient) spread_pixels(w, d, s->gradient + out);
-    for (int64_t k = 0; k < s->states; k++) {
-        transform_state(w, k, d);
-        if (!s->gradient) add_light(w, s->weights[k], d);
-        else {
-            of_weights[k] += light_gradient(w, s->weights[k], d);
-            transform_state_back(w, k, d);
+    for (int64_t e = 0; e < s->exposures; e++) {
+        const matrix *pixels = w->pixels + 4 * e * s->shifts;
+        if (s->gradient) spread_pixels(w, pixels, d, s->gradient + out + e * size);
+        else memset(d->light, 0, s->samples * w->along * sizeof(vec));
+        for (int64_t k = 0; k < s->states; k++) {
+            transform_state(w, e * s->states + k, d);
+            if (!s->gradient) add_light(w, s->weights[k], d);
+            else {
+                of_weights[k] += light_gradient(w, s->weights[k], d);
+                transform_state_back(w, e * s->states + k, d);
+            }
         }
+        if (!s->gradient) sum_pixels(w, pixels, d, s->light + out + e * size);
     }
     if (s->gradient) gather_waves(w, d, of_waves);
-    else sum_pixels(w, d, s->light + out);
 }
 
 static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
@@ -485,23 +488,23 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     if (!status) {
         memset(w->desks, 0, s->threads * w->size * sizeof(vec));
         fill_weights(w, places);
-        for (int64_t v = 0; v < s->shifts; v++) {
-            const int64_t at = (place * s->shifts + v) * s->window * s->samples;
+        for (int64_t v = 0; v < s->exposures * s->shifts; v++) {
+            const int64_t at = (place * s->exposures * s->shifts + v) * s->window * s->samples;
             for (int n = 0; n < 4; n++)
                 matrices = lay_out(w->pixels + 4 * v + n, (n % 2 ? s->rows : s->columns) + at, n < 2 ? s->window : s->samples,
                                    n < 2 ? s->samples : s->window, n >= 2, matrices);
         }
-        const int64_t numbers = s->states * (2 * s->cells + 1);
+        const int64_t waves = 2 * s->exposures * s->states * s->cells, numbers = waves + s->states;
         if (s->gradient) memset(parts, 0, s->depths * numbers * sizeof(REAL));
 #pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
         for (int64_t depth = 0; depth < s->depths; depth++) {
             REAL *own = s->gradient ? parts + depth * numbers : 0;
-            compute(w, place, depth, own, s->gradient ? own + 2 * s->states * s->cells : 0);
+            compute(w, place, depth, own, s->gradient ? own + waves : 0);
         }
         for (int64_t depth = 0; depth < s->depths && s->gradient; depth++) {
             const REAL *own = parts + depth * numbers;
-            for (int64_t n = 0; n < 2 * s->states * s->cells; n++) s->of_waves[n] += own[n];
-            for (int64_t k = 0; k < s->states; k++) s->of_weights[k] += own[2 * s->states * s->cells + k];
+            for (int64_t n = 0; n < waves; n++) s->of_waves[n] += own[n];
+            for (int64_t k = 0; k < s->states; k++) s->of_weights[k] += own[waves + k];
         }
     }
     free(w->row_weights), free(w->column_weights), free(w->desks);
@@ -513,12 +516,12 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
 int scattered_light(const scattered *s) {
     const int64_t half = s->samples / 2, spread = s->extent / 2;
     const int64_t tables = 2 * (matrix_size(half, spread) + matrix_size(spread, half)),
-                  pixels = 2 * s->shifts * (matrix_size(s->window, s->samples) + matrix_size(s->samples, s->window));
+                  pixels = 2 * s->exposures * s->shifts * (matrix_size(s->window, s->samples) + matrix_size(s->samples, s->window));
     work own = {.s = s}, *w = &own;
     char *matrices = malloc(tables + pixels);
     w->start = malloc(2 * s->patches * sizeof(int64_t) + 1);
-    w->pixels = malloc(4 * s->shifts * sizeof(matrix) + 1);
-    REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->cells + 1) * sizeof(REAL) + 1) : 0;
+    w->pixels = malloc(4 * s->exposures * s->shifts * sizeof(matrix) + 1);
+    REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->exposures * s->cells + 1) * sizeof(REAL) + 1) : 0;
     int status = matrices && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
     if (!status) {
         char *rest = lay_out(&w->cosines, s->cosines, half, spread, 0, matrices);

@@ -1,9 +1,9 @@
 r"""Operator of the light in the pixels of a sensor from scattered points in the stop of a lens. In C.
 
-.. math:: I_{fdv} = R_{fv} \Big( \sum_k w_k \, |T G_{fdk} T^T|^2 \Big) C_{fv}^T, \qquad
-          G_{fdk} = \sum_c u_{kc} \sum_s a_{fdcs} \, \varphi(y_{fcs}) \, \varphi(x_{fcs})^T
+.. math:: I_{fdev} = R_{fev} \Big( \sum_k w_k \, |T G_{fdek} T^T|^2 \Big) C_{fev}^T, \qquad
+          G_{fdek} = \sum_c u_{ekc} \sum_s a_{fdcs} \, \varphi(y_{fcs}) \, \varphi(x_{fcs})^T
 
-The points s of a patch c of the stop share the wave u of a cell. They lie at (y, x) on a grid, on which a kernel
+The points s of a patch c of the stop share the wave u of a cell, which differs between exposures e. They lie at (y, x) on a grid, on which a kernel
 :math:`\varphi` spreads them. T transforms the grid to samples on the sensor along either axis, R and C sum samples to
 pixels. The gradients of waves and weights are also computed in C; gradients of gradients come from the same in torch.
 """
@@ -64,15 +64,15 @@ def scattered_light(
     r"""Return the light in the pixels of a sensor: operator ``kornia_tidy::scattered_light``.
 
     Args:
-        waves: u, (K, N) complex64 or complex128 on a processor.
+        waves: u, (E, K, N) complex64 or complex128 on a processor.
         weights: w, (K,), of the waves' real dtype.
         points: a, y and x of the points.
         transform: kernel and T.
-        rows: R, (F, V, P, Q).
-        columns: C, (F, V, P, Q).
+        rows: R, (F, E, V, P, Q).
+        columns: C, (F, E, V, P, Q).
 
     Returns:
-        (F, D, V, P, P). It has gradients with respect to waves and weights, which can be differentiated in turn.
+        (F, D, E, V, P, P). It has gradients with respect to waves and weights, which can be differentiated in turn.
 
     Raises:
         TypeError: if a data type is not as above.
@@ -89,7 +89,7 @@ def scattered_light_by_torch(
     """Return the same by plain operations, on any device, see :func:`scattered_light`."""
     width, kernel, cosines, sines = transform
     extent, found = 2 * cosines.shape[1], []
-    own, phases = waves[:, points.cell], points.phase_terms.shape[1]
+    own, phases = waves[..., points.cell], points.phase_terms.shape[1]
     for values, down, right in zip(points.values, rows, columns, strict=True):
         (top, below), (left, beside) = (_spread(place, width, kernel, extent) for place in values[:2])
         lines, across = (torch.arange(part.shape[-1], device=waves.device) for part in (below, beside))
@@ -98,12 +98,12 @@ def scattered_light_by_torch(
             phase = torch.tensordot(p, values[2 : 2 + phases], 1)
             field = torch.polar(torch.tensordot(q, values[2 + phases :], 1), 2 * torch.pi * (phase - phase.round()))
             parts = (below.mT @ (part.to(kernel.dtype)[..., None] * beside) for part in (field.real, field.imag))
-            flat = (own[:, :, None, None] * torch.complex(*parts)).flatten(1)
-            grid = flat.new_zeros(len(waves), extent**2).index_add(1, index, flat).unflatten(1, (extent, extent))
+            flat = (own[..., None, None] * torch.complex(*parts)).flatten(2)
+            grid = flat.new_zeros(*own.shape[:2], extent**2).index_add(2, index, flat).unflatten(2, (extent, extent))
             sample = _transformed(_transformed(grid, cosines, sines).mT, cosines, sines)  # columns first
-            light = torch.einsum("k,kxy->xy", weights, sample.real.square() + sample.imag.square())
-            found.append(down @ light.T @ right.mT)
-    shape = len(rows), len(points.phase_terms), *rows.shape[1:3], columns.shape[2]
+            light = torch.einsum("k,ekxy->eyx", weights, sample.real.square() + sample.imag.square())
+            found.append(down @ light[:, None] @ right.mT)
+    shape = len(rows), len(points.phase_terms), *rows.shape[1:4], columns.shape[3]
     return torch.stack(found).view(shape)
 
 
@@ -137,8 +137,8 @@ class _Scattered(Parameters):
     """The struct ``scattered`` in scattered.c."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("places", "depths", "states", "cells", "patches", "points", "phases")),
-        *((name, ctypes.c_int64) for name in ("amplitudes", "width", "degree", "extent", "samples", "shifts")),
+        *((name, ctypes.c_int64) for name in ("places", "depths", "exposures", "states", "cells", "patches", "points")),
+        *((name, ctypes.c_int64) for name in ("phases", "amplitudes", "width", "degree", "extent", "samples", "shifts")),
         *((name, ctypes.c_int64) for name in ("window", "threads")),
         *((name, ctypes.c_void_p) for name in ("cell", "values", "phase_terms", "amplitude_terms", "kernel", "waves")),
         *((name, ctypes.c_void_p) for name in ("weights", "cosines", "sines", "rows", "columns", "gradient", "light")),
@@ -179,9 +179,9 @@ def _new_light(
     for name, part in terms.items():
         if part.dtype != (kind := torch.int64 if part is cell else torch.float64):
             raise TypeError(f"{name} must be {str(kind).removeprefix('torch.')}, got {part.dtype}")
-    if waves.ndim != 2 or tuple(weights.shape) != tuple(waves.shape[:1]):
+    if waves.ndim != 3 or tuple(weights.shape) != tuple(waves.shape[1:2]):
         shapes = tuple(waves.shape), tuple(weights.shape)
-        raise ValueError(f"waves and weights must have shapes (K, N) and (K,), got {shapes[0]} and {shapes[1]}")
+        raise ValueError(f"waves and weights must have shapes (E, K, N) and (K,), got {shapes[0]} and {shapes[1]}")
     depths, phases = phase_terms.shape
     expected = len(rows), 2 + phases + amplitude_terms.shape[1], *cell.shape
     if values.ndim != 4 or tuple(values.shape[:3]) != expected or len(amplitude_terms) != depths:
@@ -192,12 +192,12 @@ def _new_light(
         )
     if cosines.ndim != 2 or cosines.shape != sines.shape:
         raise ValueError(f"cosines and sines must have one shape, got {tuple(cosines.shape)} and {tuple(sines.shape)}")
-    if rows.ndim != 4 or rows.shape != columns.shape or rows.shape[3] != 2 * len(cosines):
+    if rows.ndim != 5 or rows.shape != columns.shape or rows.shape[1::3] != (len(waves), 2 * len(cosines)):
         raise ValueError(
-            f"rows and columns must have shape (F, V, P, {2 * len(cosines)}), got {tuple(rows.shape)} and "
+            f"rows and columns must have shape (F, {len(waves)}, V, P, {2 * len(cosines)}), got {tuple(rows.shape)} and "
             f"{tuple(columns.shape)}"
         )
-    return weights.new_empty(len(rows), depths, *rows.shape[1:3], rows.shape[2])
+    return weights.new_empty(len(rows), depths, *rows.shape[1:4], rows.shape[3])
 
 
 def _light(*given: Any) -> Tensor:
@@ -211,7 +211,7 @@ def _new_gradients(waves: Tensor, weights: Tensor, *given: Any) -> tuple[Tensor,
 
 
 def _gradients(waves: Tensor, weights: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
-    """Return (K, N) and (K,), summed in the same order every time."""
+    """Return (E, K, N) and (K,), summed in the same order every time."""
     *points, gradient = given
     found = _new_gradients(waves, weights)
     if gradient.shape != _new_light(waves, weights, *points).shape:
@@ -227,13 +227,14 @@ def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
         for out in gradients.values() or (light,):
             out.zero_()
         return
-    if int(cell.min()) < 0 or int(cell.max()) >= waves.shape[1]:
-        raise IndexError(f"cell must lie from 0 to {waves.shape[1] - 1}, got {int(cell.min())} to {int(cell.max())}")
+    if int(cell.min()) < 0 or int(cell.max()) >= waves.shape[2]:
+        raise IndexError(f"cell must lie from 0 to {waves.shape[2] - 1}, got {int(cell.min())} to {int(cell.max())}")
     scattered = _Scattered(
         places=len(rows),
         depths=len(phase_terms),
-        states=len(waves),
-        cells=waves.shape[1],
+        exposures=len(waves),
+        states=waves.shape[1],
+        cells=waves.shape[2],
         patches=len(cell),
         points=values.shape[3],
         phases=phase_terms.shape[1],
@@ -242,8 +243,8 @@ def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
         degree=len(kernel) - 1,
         extent=2 * cosines.shape[1],
         samples=2 * len(cosines),
-        shifts=rows.shape[1],
-        window=rows.shape[2],
+        shifts=rows.shape[2],
+        window=rows.shape[3],
     )
     scattered.point_to(
         cell=cell,

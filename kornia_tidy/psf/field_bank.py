@@ -14,7 +14,7 @@ from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.psf.field import Field
-from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, turned_lenses
+from kornia_tidy.psf.lens_psfs import Screen, Sensor, lens_light, lens_limits, lens_psfs, mirror_images, turned_lenses
 from kornia_tidy.psf.measured_field import place_weights
 from kornia_tidy.psf.psf_bank import BankOfPSFs, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
@@ -201,34 +201,77 @@ def field_psf_bank(
         >>> field_psf_bank(mask, torch.ones(1), stop, grey, [1.0], [0.0], [(0, 0)], lens, 8e-6, 23).psfs.shape
         torch.Size([1, 1, 1, 23, 23])
     """
+    psfs, light = field_psfs(
+        phase, weights, pupil, spectrum, dispersion, defocus, field, lens, pixel_pitch, window, tolerance
+    )
+    points = phase.new_tensor([list(point) for point in field])
+    psfs = psfs.movedim(1, 0)
+    return FieldBank(psfs * light[..., None, None], phase.new_tensor(defocus), points, psfs.sum((-2, -1)), light)
+
+
+def field_psfs(
+    phase: Tensor,
+    weights: Tensor,
+    pupil: Pupil,
+    spectrum: Spectrum,
+    dispersion: Sequence[float],
+    defocus: Sequence[float],
+    field: Sequence[tuple[float, float]],
+    lens: Lens,
+    pixel_pitch: float,
+    window: int,
+    tolerance: float,
+) -> tuple[Tensor, Tensor]:
+    """Return the PSFs of :func:`field_psf_bank` in parts of the light of their channel, (D, F, C, P, P), and that light.
+
+    The light of a channel, that of all planes of its basis of spectra, is (F, D, C), in parts of that on the axis.
+
+    Args:
+        phase: this and the other arguments are those of :func:`field_psf_bank`.
+        weights: as there.
+        pupil: as there.
+        spectrum: as there.
+        dispersion: as there.
+        defocus: as there.
+        field: as there.
+        lens: as there.
+        pixel_pitch: as there.
+        window: as there.
+        tolerance: as there.
+    """
     phase, pupil = _merged(phase, pupil)
     sensor = Sensor(pixel_pitch, window, min(max(tolerance / 10, _LEAST), _MOST))
     apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
-    metres = [(0.0, 0.0), *((y * pixel_pitch, x * pixel_pitch) for y, x in field)]
-    planes: list[list[Tensor]] = [[] for _ in spectrum.plane_weights]
+    quadrant, images = mirror_images([(y * pixel_pitch, x * pixel_pitch) for y, x in field])
+    parts: list[list[tuple[Tensor, list[Tensor]]]] = [[] for _ in spectrum.plane_weights]
     lights: list[list[Tensor]] = [[] for _ in spectrum.plane_weights]
     for w, wavelength in enumerate(spectrum.wavelengths):
         seen, mixing = _mixing(spectrum, w)
         if not seen:
             continue
-        axis, *turned = turned_lenses(lens.table, metres, defocus, wavelength)
+        axis, *turned = turned_lenses(lens.table, [(0.0, 0.0), *quadrant], defocus, wavelength)
         on_axis = lens_light(whole_cells(pupil), pupil.transmission, [axis], sensor.tolerance).to(weights)[0]
         if not bool((on_axis > 0).all()):  # False for NaN too
             raise ValueError(
                 f"aperture must let some light through the lens's stop and be finite, got an open area of "
                 f"{float(on_axis.min())}"
             )
-        limits = lens_limits(lens, defocus, wavelength)
-        energies, area = lens_psfs(screens[w], weights, pupil.transmission, turned, limits, sensor, apart[:, w, seen])
-        share = area / on_axis
+        limits, given = lens_limits(lens, defocus, wavelength), (screens[w], weights, pupil.transmission)
+        energies, passed, area = lens_psfs(*given, turned, images, limits, sensor, apart[:, w, seen])
         for plane, v, weight in mixing:
-            lights[plane].append(weight * share)
-            planes[plane].append(lights[plane][-1][..., None, None] * energies[:, :, v])
-    whole, there = (torch.stack([sum(own[1:], own[0]) for own in parts], 2) for parts in (planes, lights))
-    energy = whole.sum((-2, -1)) / torch.where(there == 0, torch.ones_like(there), there)
-    points = phase.new_tensor([list(point) for point in field])
-    return FieldBank(whole, phase.new_tensor(defocus), points, energy, there)
+            lights[plane].append(weight * area / on_axis)
+            parts[plane].append((lights[plane][-1] / passed, [own[:, v] for own in energies]))
+    there = torch.stack([sum(own[1:], own[0]) for own in lights], 2)
+    basis = len(spectrum.basis or (1,))
+    light = there.unflatten(2, (-1, basis)).sum(3).repeat_interleave(basis, 2)
+    per_channel = torch.where(light == 0, 1, light)
+    psfs = []
+    for f in range(len(field)):
+        for plane, own in enumerate(parts):
+            scaled = [energies[f] * (shares[f] / per_channel[f, :, plane])[:, None, None] for shares, energies in own]
+            psfs.append(sum(scaled[1:], scaled[0]))
+    return torch.stack(psfs, 1).unflatten(1, (len(field), -1)), light
 
 
 def _merged(phase: Tensor, pupil: Pupil) -> tuple[Tensor, Pupil]:

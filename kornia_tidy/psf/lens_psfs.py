@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -67,16 +69,48 @@ class Limits:
     cosine: float
 
 
+class Image(NamedTuple):
+    """A point of the field as the mirror image of another one.
+
+    Args:
+        index: of the other one.
+        down: whether y changes its sign.
+        right: whether x does.
+    """
+
+    index: int
+    down: bool
+    right: bool
+
+
+def mirror_images(
+    field: Sequence[tuple[float, float]],
+) -> tuple[list[tuple[float, float]], list[Image]]:
+    """Return the points of a field's quadrant of positive y and x, and how all points are mirror images of these.
+
+    A lens is symmetric about its axis, so that a PSF is the mirror image of one behind mirrored masks. All points are
+    computed in one quadrant, so that a PSF does not depend on which others are asked for.
+
+    Example:
+        >>> mirror_images([(1.0, -2.0), (-1.0, -2.0), (0.0, 3.0)])[0]
+        [(1.0, 2.0), (0.0, 3.0)]
+    """
+    known: dict[tuple[float, float], int] = {}
+    images = [Image(known.setdefault((abs(y), abs(x)), len(known)), y < 0, x < 0) for y, x in field]
+    return list(known), images
+
+
 @on_cpu
 def lens_psfs(
     screens: Sequence[Screen],
     weights: Tensor,
     transmission: Tensor,
     turned: Sequence[TurnedLens],
+    images: Sequence[Image],
     limits: Limits,
     sensor: Sensor,
     shifts: Tensor,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[list[Tensor], Tensor, Tensor]:
     r"""Return PSFs at field points and one wavelength, averaged over states, and the light there.
 
     .. math:: h(p) = \int_p \Big| \int_{stop} \sqrt{J}\, U e^{i W} e^{2 \pi i (L x + M y) / \lambda} \Big|^2
@@ -85,31 +119,37 @@ def lens_psfs(
     ray's. Each cell is integrated by Gauss-Legendre quadrature, cut at the stop's edge and at the rims that vignette.
 
     Args:
-        screens: fields in the stop, which add up.
+        screens: fields in the stop, which add up. Their cells lie evenly about the axis.
         weights: share of the exposure of each state, (K,).
         transmission: of light by the cells of the last screen, (N, N) float64.
-        turned: the lens at F field points, see :func:`turned_lenses`.
+        turned: the lens at some field points, see :func:`turned_lenses`.
+        images: F field points as mirror images of these, see :func:`mirror_images`.
         limits: of the lens, see :func:`lens_limits`.
         sensor: pixels, window and tolerance.
         shifts: of the light along y and x in pixels, for each of V copies of the PSFs, (F, V, 2).
 
     Returns:
-        Share of the light in each pixel, (F, D, V, P, P), and the area of direction cosines that an even scene fills,
-        (F, D): see :func:`lens_light`.
+        Light in each pixel, (D, V, P, P) for each of F points; that of the whole sensor, (F, D); and the area of
+        direction cosines that an even scene fills, (F, D): see :func:`lens_light`.
     """
     scale = sensor.pitch / turned[0].wavelength  # cycles per pixel of a direction cosine
     widest = max(float((screen.spans[1] - screen.spans[0]).max()) for screen in screens)
     half = max(phase + math.pi * sensor.window * scale * cosines for phase, cosines in limits.slopes) * widest / 2
     grid = scattered_grid(limits.cosine * scale, sensor.window, sensor.tolerance, float(shifts.abs().max()))
-    waves, device = torch.cat([screen.waves.flatten(1) for screen in screens], 1), weights.device
-    groups, energies, areas = _alike(turned), [], []
-    for same in groups:
-        seen = [turned[i] for i in same]
+    sides = [screen.waves.shape[-1] for screen in screens]
+    firsts = [sum(side**2 for side in sides[:n]) for n in range(len(sides))]
+    whole = [transmission.new_empty(0)] * len(images)
+    energies, passed, areas = list(whole), list(whole), list(whole)
+    for members in _alike(turned, images):
+        seen = [turned[images[own[0]].index] for own in members]
+        mirrors = [images[i][1:] for i in members[0]]
         stops = [_stop(seen[0], screen.spans, half, sensor.tolerance) for screen in screens]
-        passed, area = _light(seen, stops[-1], transmission)
-        passed = torch.where(passed == 0, 1, passed)  # where the rims cut all that the aperture leaves open it is dark
-        sides = [screen.waves.shape[-1] for screen in screens]
-        firsts = [sum(side**2 for side in sides[:n]) for n in range(len(sides))]
+        for e, mirror in enumerate(mirrors):
+            light, area = _light(seen, stops[-1], _mirrored(transmission, mirror))
+            light = torch.where(light == 0, 1, light)  # where the rims cut all that the aperture leaves open it is dark
+            for own, *found in zip(members, light.to(weights), area.to(weights), strict=True):
+                passed[own[e]], areas[own[e]] = found
+        waves = torch.stack([torch.cat([_mirrored(s.waves, m).flatten(1) for s in screens], 1) for m in mirrors])
         cells = torch.cat(
             [
                 first + stop.points.row * side + stop.points.column
@@ -122,15 +162,19 @@ def lens_psfs(
         rows, many = _rows(seen, -scale / grid.step, (grid.extent - 1) / 2), 2 + terms[0].shape[1]
         at_once = max(1, _MEMORY // (8 * rows.shape[1] * max(basis.shape[1], 1)))
         for start in range(0, len(seen), at_once):
-            part = slice(start, start + at_once)
+            part, here = slice(start, start + at_once), torch.tensor(members[start : start + at_once])
             values = torch.stack([row @ basis for row in rows[part]]).unflatten(-1, weight.shape)
             values[:, many:] *= weight
-            points = Points(*(own.to(device) for own in (cells, values, *terms)))
-            sums = (grid.sums(sensor.window, shifts[same[part], :, axis]).to(device) for axis in (0, 1))
+            points = Points(*(own.to(weights.device) for own in (cells, values, *terms)))
+            sums = []
+            for axis in (0, 1):
+                own = [grid.sums(sensor.window, shifts[here[:, e], :, axis], m[axis]) for e, m in enumerate(mirrors)]
+                sums.append(torch.stack(own, 1).to(weights.device))
             found = scattered_energies(waves, weights, points, grid, *sums)
-            energies.append(found / passed[part].to(found)[..., None, None, None])
-        areas.append(area.to(weights))
-    return torch.cat(energies)[_in_order(groups)], torch.cat(areas)[_in_order(groups)]
+            for own, light in zip(members[part], found, strict=True):  # (D, E, V, P, P)
+                for i, energy in zip(own, light.unbind(1), strict=True):
+                    energies[i] = energy
+    return energies, torch.stack(passed), torch.stack(areas)
 
 
 @on_cpu
@@ -143,11 +187,13 @@ def lens_light(spans: Tensor, transmission: Tensor, turned: Sequence[TurnedLens]
         turned: the lens at the field points.
         tolerance: of the area.
     """
-    groups, areas = _alike(turned), []
-    for same in groups:
-        seen = [turned[i] for i in same]
-        areas.append(_light(seen, _stop(seen[0], spans, 0.0, tolerance), transmission)[1])
-    return torch.cat(areas)[_in_order(groups)]
+    areas = [torch.empty(0)] * len(turned)
+    for members in _alike(turned, [Image(i, down=False, right=False) for i in range(len(turned))]):
+        seen = [turned[i] for (i,) in members]
+        found = _light(seen, _stop(seen[0], spans, 0.0, tolerance), transmission)[1]
+        for (i,), area in zip(members, found, strict=True):
+            areas[i] = area
+    return torch.stack(areas)
 
 
 @on_cpu
@@ -230,17 +276,27 @@ class Stop:
     moments: Tensor
 
 
-def _alike(turned: Sequence[TurnedLens]) -> list[list[int]]:
-    """Return the field points from which the open stop and the masks on it look the same."""
-    found: dict[tuple[float, ...], list[int]] = {}
-    for i, own in enumerate(turned):
-        found.setdefault((*own.discs().flatten().tolist(), *own.shift), []).append(i)
+def _alike(turned: Sequence[TurnedLens], images: Sequence[Image]) -> list[list[list[int]]]:
+    """Return groups of lenses from which the open stop and the masks on it look the same, with the same mirrors.
+
+    Of each lens the numbers of its images.
+    """
+    of_lens: dict[tuple[int, int], list[int]] = {}  # a point that is asked for twice is an image of a lens of its own
+    times: Counter[Image] = Counter()
+    for i, image in enumerate(images):
+        of_lens.setdefault((image.index, times[image]), []).append(i)
+        times[image] += 1
+    found: dict[Hashable, list[list[int]]] = {}
+    for (index, _), own in of_lens.items():
+        own.sort(key=lambda i: images[i])
+        lens, mirrors = turned[index], tuple(images[i][1:] for i in own)
+        found.setdefault((*lens.discs().flatten().tolist(), *lens.shift, mirrors), []).append(own)
     return list(found.values())
 
 
-def _in_order(groups: list[list[int]]) -> Tensor | slice:
-    """Return where the field points stand in groups that follow each other."""
-    return slice(None) if len(groups) == 1 else torch.tensor([i for same in groups for i in same]).argsort()
+def _mirrored(values: Tensor, mirror: tuple[bool, bool]) -> Tensor:
+    """Return values of cells, (..., N, N), mirrored along y and x."""
+    return values.flip([axis for axis, turns in zip((-2, -1), mirror, strict=True) if turns])
 
 
 def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:

@@ -39,6 +39,7 @@ from kornia_tidy.psf.field_bank import (
     checked_places,
     field_light,
     field_psf_bank,
+    field_psfs,
     light_on_axis,
 )
 from kornia_tidy.psf.field_nodes import field_nodes
@@ -230,8 +231,8 @@ class PSFModel:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
             nodes = self.defocus_nodes if defocus is None else tuple(defocus)
             self._warn_if_beyond(points, nodes)
-            found = self._lens_psfs(spectrum.flat(), *self.states(dtype), nodes, self.window, points, tolerance)
-            return found.with_stray_light(self.fidelity.stray_light)
+            given = self._of_lens(spectrum.flat(), nodes, self.window, points, tolerance)
+            return field_psf_bank(*self.states(dtype), **given).with_stray_light(self.fidelity.stray_light)
         if self.measured is not None:
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
@@ -240,20 +241,26 @@ class PSFModel:
         own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # remembered ones stay as they are
         return own.with_stray_light(self.fidelity.stray_light)
 
-    def _lens_psfs(
+    def _of_lens(
         self,
         spectrum: Spectrum,
-        states: Tensor,
-        weights: Tensor,
         nodes: Sequence[float],
         window: int,
         field: Sequence[tuple[float, float]],
         tolerance: float,
-    ) -> FieldBank:
-        dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
-        lens, pupil = cast("Lens", self.lens), self.pupil
-        sensor = lens, self.camera.pixel_pitch, window, tolerance
-        return field_psf_bank(states, weights, pupil, spectrum, dispersion, nodes, field, *sensor)
+    ) -> dict[str, Any]:
+        """Return what PSFs behind a lens depend on besides states and weights."""
+        return {
+            "pupil": self.pupil,
+            "spectrum": spectrum,
+            "dispersion": [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths],
+            "defocus": nodes,
+            "field": field,
+            "lens": cast("Lens", self.lens),
+            "pixel_pitch": self.camera.pixel_pitch,
+            "window": window,
+            "tolerance": tolerance,
+        }
 
     def scene_bank(
         self,
@@ -296,8 +303,8 @@ class PSFModel:
         bank = self._computed_bank(spectrum, dtype, samples, each_state, field=field)
         band = self._band() if kind == "bandlimited" else None
         bank = interpolated_bank(bank, samples, targets, band)
-        bank = (bank if spectrum.basis else not_negative(bank)).with_stray_light(*stray_light)
-        return bank if field is None else self._lit(bank, spectrum, field)
+        bank = bank if spectrum.basis else not_negative(bank)
+        return self._finished(bank, stray_light, spectrum, field)
 
     def _warn_if_beyond(self, points: Sequence[tuple[float, float]], nodes: Sequence[float]) -> None:
         lens = cast("Lens", self.lens)
@@ -305,8 +312,17 @@ class PSFModel:
         for wavelength in (min(self._sampled.wavelengths), max(self._sampled.wavelengths)):
             lens.warn_if_beyond(heights, torch.tensor(nodes, dtype=torch.float64), wavelength)
 
-    def _lit(self, bank: PSFBank, spectrum: Spectrum, field: Field) -> FieldBank:
-        """Return PSFs over a field, (D, F C, P, P) and each with the light that an ideal lens would give it, lit."""
+    def _finished(
+        self, bank: PSFBank, stray_light: tuple[str, int] | None, spectrum: Spectrum, field: Field | None
+    ) -> PSFBank | FieldBank:
+        """Return PSFs after something was done about stray light, where it is not None; of a field with its light.
+
+        PSFs of a field are given as (D, F C, P, P), each with the light that an ideal lens would give it.
+        """
+        if stray_light is None:
+            return bank
+        if field is None:
+            return bank.with_stray_light(*stray_light)
         lens, pitch, pupil = cast("Lens", self.lens), self.camera.pixel_pitch, self.pupil
         passed, flat, nodes = pupil.transmission, spectrum.flat(), tuple(bank.defocus.tolist())
 
@@ -318,10 +334,14 @@ class PSFModel:
         (light,) = light_at(nodes) if new else MEMORY.recall(values_of(*parts), nodes, light_at)
         light = light.to(bank.psfs)
         light = light.repeat_interleave(bank.psfs.shape[1] // light[0].numel(), 2)  # (D, F, C)
-        psfs, energy = (own.unflatten(1, (-1, light.shape[-1])) for own in (bank.psfs, bank.energy))
-        veil = None if bank.veil is None else (bank.veil.unflatten(1, (-1, light.shape[-1])) * light).movedim(1, 0)
-        lit, places = psfs * light[..., None, None], bank.psfs.new_tensor(field.points)
-        rest = energy.movedim(1, 0), light.movedim(1, 0), veil
+        each = light.shape[1:]
+        if stray_light == ("renormalize", 1):  # in one step with the light
+            scale = light / bank.energy.clamp(min=torch.finfo(light.dtype).tiny).unflatten(1, each)
+        else:
+            bank, scale = bank.with_stray_light(*stray_light), light
+        lit, places = bank.psfs.unflatten(1, each) * scale[..., None, None], bank.psfs.new_tensor(field.points)
+        veil = None if bank.veil is None else (bank.veil.unflatten(1, each) * light).movedim(1, 0)
+        rest = bank.energy.unflatten(1, each).movedim(1, 0), light.movedim(1, 0), veil
         return FieldBank(lit.movedim(1, 0), bank.defocus, places, *rest)
 
     def field_of(self, size: tuple[int, int], center: tuple[float, float] = (0.0, 0.0)) -> Field | None:
@@ -412,8 +432,7 @@ class PSFModel:
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
 
         def finished(bank: PSFBank) -> PSFBank | FieldBank:
-            bank = bank if stray_light is None else bank.with_stray_light(*stray_light)
-            return bank if field is None or stray_light is None else self._lit(bank, spectrum, field)
+            return self._finished(bank, stray_light, spectrum, field)
 
         unread = Mode.UNREAD in torch_mode()
         if not self._remembers or learning or traced or unread or next(self.camera.parameters(), None) is not None:
@@ -458,15 +477,11 @@ class PSFModel:
         if self.lens is not None:
             rest = nodes, window, points, tolerance or self.fidelity.pixel_tolerance
             if each_state:
-                one = torch.ones_like(weights[:1])
-                shown = enumerate(states[:, None])
-                banks = [self.of_state(k)._lens_psfs(spectrum, own, one, *rest) for k, own in shown]
+                one, shown = torch.ones_like(weights[:1]), enumerate(states[:, None])
+                found = [field_psfs(own, one, **self.of_state(k)._of_lens(spectrum, *rest))[0] for k, own in shown]
+                psfs = torch.cat(found, 1).flatten(1, 2)
             else:
-                banks = [self._lens_psfs(spectrum, states, weights, *rest)]
-            basis = len(spectrum.basis or (1,))  # with planes that have the light of their channel
-            light = banks[0].light.unflatten(2, (-1, basis)).sum(3).repeat_interleave(basis, 2)
-            light = torch.where(light == 0, 1, light)[..., None, None]
-            psfs = torch.cat([(bank.psfs / light).movedim(0, 1).flatten(1, 2) for bank in banks], 1)
+                psfs = field_psfs(states, weights, **self._of_lens(spectrum, *rest))[0].flatten(1, 2)
             return PSFBank(psfs, states.new_tensor(nodes), psfs.sum((2, 3)))
         if self.fidelity.propagation == "paper":
             if pupil.fill_factor != 1:

@@ -58,15 +58,23 @@ class Grid:
     reach: int
     decay: float
 
-    def sums(self, window: int, shifts: Tensor) -> Tensor:
-        """Return the sums over samples that give the light in pixels along an axis, (F, V, P, N), for shifts (F, V)."""
+    def sums(self, window: int, shifts: Tensor, mirrored: bool = False) -> Tensor:
+        """Return the sums over samples that give the light in pixels along an axis, (F, V, P, N).
+
+        Args:
+            window: P.
+            shifts: of the light in the pixels, (F, V).
+            mirrored: whether the samples are those of the light's mirror image.
+        """
         if not bool(shifts.any()):
-            return self._centred(window).expand(*shifts.shape, -1, -1)
-        return torch.stack([self._shifted(window, tuple(row)) for row in shifts.tolist()])
+            return self._centred(window, mirrored).expand(*shifts.shape, -1, -1)
+        found = torch.stack([self._shifted(window, tuple(row)) for row in shifts.tolist()])
+        return found.flip(-1) if mirrored else found
 
     @lru_cache(maxsize=8)  # noqa: B019 (grids are remembered themselves)
-    def _centred(self, window: int) -> Tensor:
-        return self._shifted(window, (0.0,))[0]
+    def _centred(self, window: int, mirrored: bool) -> Tensor:
+        found = self._shifted(window, (0.0,))[0]
+        return found.flip(-1) if mirrored else found
 
     def _shifted(self, window: int, shifts: tuple[float, ...]) -> Tensor:
         count = 2 * len(self.cosines)
@@ -111,14 +119,14 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
 def scattered_energies(
     waves: Tensor, weights: Tensor, points: Points, grid: Grid, rows: Tensor, columns: Tensor
 ) -> Tensor:
-    """Return the light in each pixel, averaged over states, for each shift, (F, D, V, P, P).
+    """Return the light in each pixel, averaged over states, for each exposure and shift, (F, D, E, V, P, P).
 
     Args:
-        waves: of each state and cell, (K, N) complex.
+        waves: of each exposure, state and cell, (E, K, N) complex.
         weights: share of the exposure of each state, (K,).
         points: of F fields.
         grid: that they are spread on.
-        rows: sums over samples for the pixels along y, (F, V, P, N).
+        rows: sums over samples for the pixels along y, (F, E, V, P, N).
         columns: the same along x.
     """
     transform = Transform(grid.width, *(part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines)))

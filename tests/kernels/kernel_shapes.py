@@ -402,7 +402,7 @@ def scattered(draw: random.Random) -> Call:
 def scattered_gradient(draw: random.Random) -> Call:
     """The same for a gradient of the light: that of the waves."""
     case, about, products = _scattered(draw)
-    light = torch.randn(len(case[3]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 2)), dtype=case[1].dtype)
+    light = torch.randn(len(case[3]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 3, 3)), dtype=case[1].dtype)
 
     def truth() -> tuple[Tensor, Tensor]:
         exact = [case[0].to(torch.complex128, copy=True).requires_grad_(), case[1].double()]
@@ -444,7 +444,7 @@ def scattered_written_out(
     whole = torch.cat([upper.flip(0).conj(), upper])
     large = whole.real.abs() + whole.imag.abs()
     found, allowed = [], []
-    roundings = points * patches + 2 * extent + 2 * len(waves) + len(whole) + 8 * len(kernel) + 64
+    roundings = points * patches + 2 * extent + 2 * len(weights) + len(whole) + 8 * len(kernel) + 64
     for place, down, right in zip(values, rows.double(), columns.double(), strict=True):
         inside = 1 - (2 * (lines - place[:2, ..., None]) / width).square()  # (2, C, S, M)
         spread = torch.where(inside > 0, (inside[..., None] ** powers * kernel.double()).sum(-1), 0.0)
@@ -455,14 +455,14 @@ def scattered_written_out(
                 torch.polar(torch.ones_like(size), 2 * torch.pi * torch.tensordot(p, place[2 : 2 + phases], 1)) * size
             )
             moduli = torch.tensordot(q.abs(), place[2 + phases :].abs(), 1)
-            own = waves[:, cell].to(torch.complex128)
-            grid = torch.einsum("kc,cs,csm,csn->kmn", own, field, spread[0].to(own), spread[1].to(own))
-            light = torch.einsum("k,kyx->yx", weights.double(), (whole @ grid @ whole.mT).abs().square())
-            most = torch.einsum("kc,cs,csm,csn->kmn", own.real.abs() + own.imag.abs(), moduli, *broad)
-            bound = torch.einsum("k,kyx->yx", weights.double(), (large @ most @ large.mT).square())
-            found.append(down @ light @ right.mT)
-            allowed.append(gamma(roundings, dtype) * (down.abs() @ bound @ right.mT.abs()))
-    shape = len(rows), len(phase_terms), *rows.shape[1:3], rows.shape[2]
+            own = waves[..., cell].to(torch.complex128)
+            grid = torch.einsum("ekc,cs,csm,csn->ekmn", own, field, spread[0].to(own), spread[1].to(own))
+            light = torch.einsum("k,ekyx->eyx", weights.double(), (whole @ grid @ whole.mT).abs().square())
+            most = torch.einsum("ekc,cs,csm,csn->ekmn", own.real.abs() + own.imag.abs(), moduli, *broad)
+            bound = torch.einsum("k,ekyx->eyx", weights.double(), (large @ most @ large.mT).square())
+            found.append(down @ light[:, None] @ right.mT)
+            allowed.append(gamma(roundings, dtype) * (down.abs() @ bound[:, None] @ right.mT.abs()))
+    shape = len(rows), len(phase_terms), *rows.shape[1:4], rows.shape[3]
     return torch.stack(found).view(shape), torch.stack(allowed).view(shape)
 
 
@@ -650,6 +650,7 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
     dtype = draw.choice(DTYPES)
     states, cells, patches, points = draw.randint(1, 6), draw.randint(1, 12), draw.randint(1, 20), draw.randint(1, 18)
     places, depths, shifts, width = draw.randint(1, 2), draw.randint(1, 3), draw.randint(1, 2), draw.randint(2, 8)
+    exposures = draw.randint(1, 3)
     phases, amplitudes, window = draw.randint(1, 3), draw.randint(1, 2), draw.choice((1, 3, 5, 9, 23))
     wide = draw.choice((0.0, 0.5, 2.0, 12.0))  # of a patch, in samples of the grid
     extent = 2 * (draw.randint(0, 8) + math.ceil((width + wide + 1) / 2))
@@ -659,11 +660,11 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
     rest = torch.randn(places, phases + amplitudes, patches, points, dtype=torch.float64)
     kernel = torch.rand(draw.randint(2, 9), dtype=dtype)
     kernel[0] = 0
-    sums = [torch.randn(places, shifts, window, samples, dtype=dtype) for _ in range(2)]
+    sums = [torch.randn(places, exposures, shifts, window, samples, dtype=dtype) for _ in range(2)]
     for part in sums:
         part[..., : draw.randint(0, samples)] *= draw.choice((0, 1))
     case = (
-        torch.randn(states, cells, dtype=dtype.to_complex()),
+        torch.randn(exposures, states, cells, dtype=dtype.to_complex()),
         torch.rand(states, dtype=dtype),
         torch.randint(cells, (patches,)),
         torch.cat([at, rest], 1),
@@ -676,10 +677,10 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
         *sums,
     )
     about = (
-        f"{dtype} states {states} cells {cells} patches {patches} points {points} places {places} depths {depths} "
-        f"shifts {shifts} width {width} extent {extent} samples {samples} window {window} wide {wide}"
+        f"{dtype} exposures {exposures} states {states} cells {cells} patches {patches} points {points} places {places} "
+        f"depths {depths} shifts {shifts} width {width} extent {extent} samples {samples} window {window} wide {wide}"
     )
-    products = places * depths * (patches * points * extent**2 + states * samples * extent * (samples + extent))
+    products = places * depths * (patches * points * extent**2 + exposures * states * samples * extent * (samples + extent))
     return case, about, products
 
 

@@ -92,10 +92,10 @@ class TestScatteredLight(OperatorTester):
             (3, lambda x: x.float(), TypeError, "values must be float64, got torch.float32"),
             (2, lambda x: x.int(), TypeError, "cell must be int64, got torch.int32"),
             (7, lambda x: x[:0], ValueError, r"kernel must have shape \(n,\) and a width of at least 1, got \(0,\)"),
-            (1, lambda x: x.repeat(2), ValueError, r"waves and weights must have shapes \(K, N\) and \(K,\), got"),
+            (1, lambda x: x.repeat(2), ValueError, r"waves and weights must have shapes \(E, K, N\) and \(K,\), got"),
             (3, lambda x: x[:, 1:], ValueError, "values must have shape .* for the terms, got"),
             (9, lambda x: x[1:], ValueError, "cosines and sines must have one shape, got"),
-            (10, lambda x: x[..., 1:], ValueError, r"rows and columns must have shape \(F, V, P, \d+\), got"),
+            (10, lambda x: x[..., 1:], ValueError, r"rows and columns must have shape \(F, \d+, V, P, \d+\), got"),
         ],
     )
     def test_exception(self, at, change, error, words):
@@ -123,7 +123,7 @@ class TestScatteredLightGradients(OperatorTester):
 
     def smallest(self):
         case = a_case()
-        light = torch.ones(len(case[10]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 2)), dtype=torch.float64)
+        light = torch.ones(len(case[10]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 3, 3)), dtype=torch.float64)
         return torch.ops.kornia_tidy.scattered_light_gradients(*case, light)
 
     @needs_compiler

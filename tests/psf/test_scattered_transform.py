@@ -36,9 +36,9 @@ class TestScatteredEnergies(BaseTester):
         grid = scattered_grid(highest, WINDOW, tolerance, abs(shift))
         frequency, phase, points = drawn(highest, grid)
         shifts = torch.tensor([[shift]], dtype=torch.float64)
-        sums = grid.sums(WINDOW, shifts), grid.sums(WINDOW, -shifts)
+        sums = (torch.stack([grid.sums(WINDOW, own, turns) for turns in (False, True)], 1) for own in (shifts, -shifts))
         one = torch.ones(1, dtype=torch.float64)
-        found = scattered_energies(one[None].to(torch.complex128), one, points, grid, *sums)[0, 0, 0]
+        found, mirrored = scattered_energies(one.expand(2, 1, 1) + 0j, one, points, grid, *sums)[0, 0, :, 0]
         nodes, weights = gauss_legendre(12)
         pixels = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
         field = points.values[0, 3, :, 0] * torch.exp(2j * math.pi * phase)
@@ -49,15 +49,17 @@ class TestScatteredEnergies(BaseTester):
         light = ((down * field) @ across.T).abs().square().view(WINDOW, 12, WINDOW, 12)
         expected = torch.einsum("paqb,a,b->pq", light, weights, weights)
         assert float((found - expected).abs().max()) <= 2 * tolerance
+        if not shift:
+            self.assert_close(mirrored, found.flip(0, 1), atol=1e-14, rtol=0)
 
     @pytest.mark.parametrize("tolerance", [1e-3, 1e-7])
     def test_feature_gradients_reach_waves_and_weights_alike_in_torch_and_c(self, tolerance, monkeypatch):
         grid = scattered_grid(0.3, WINDOW, tolerance)
         points = drawn(0.3, grid)[2]
-        sums = [grid.sums(WINDOW, torch.zeros(1, 1, dtype=torch.float64))] * 2
+        sums = [grid.sums(WINDOW, torch.zeros(1, 1, dtype=torch.float64))[:, None]] * 2
         found = []
         for _ in range(2):
-            waves, weights = torch.tensor([[1.0 + 0.5j], [0.2j]]).requires_grad_(), torch.rand(2, requires_grad=True)
+            waves, weights = torch.tensor([[[1.0 + 0.5j], [0.2j]]]).requires_grad_(), torch.rand(2, requires_grad=True)
             weights.data[:] = torch.tensor([0.3, 0.7])
             light = scattered_energies(waves, weights, points, grid, *sums)
             found.append((light.detach(), *torch.autograd.grad(light.square().sum(), (waves, weights))))
