@@ -138,7 +138,10 @@ class _Scattered(Parameters):
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("places", "depths", "exposures", "states", "cells", "patches", "points")),
-        *((name, ctypes.c_int64) for name in ("phases", "amplitudes", "width", "degree", "extent", "samples", "shifts")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("phases", "amplitudes", "width", "degree", "extent", "samples", "shifts")
+        ),
         *((name, ctypes.c_int64) for name in ("window", "threads")),
         *((name, ctypes.c_void_p) for name in ("cell", "values", "phase_terms", "amplitude_terms", "kernel", "waves")),
         *((name, ctypes.c_void_p) for name in ("weights", "cosines", "sines", "rows", "columns", "gradient", "light")),

@@ -175,9 +175,9 @@ def _sensor(name: str, seed: int) -> SensorNoise | None:
     return SensorNoise(0.005, full_well=2000.0, bits=8 if name == "bits" else None)
 
 
-def draw_camera(choose: Choose) -> Camera:
+def draw_camera(choose: Choose, lenses: Sequence[str] = LENSES) -> Camera:
     """Draw how to make a camera; what contradicts another part is left out."""
-    lens, compositing = choose(LENSES), choose(COMPOSITINGS)
+    lens, compositing = choose(lenses), choose(COMPOSITINGS)
     wide, hides = lens.startswith("wide"), compositing == "occlusion"
     paper = lens == "range" and compositing == "gather" and choose((False, False, False, True))
     masks = choose(("none", "none", "none", "pixelwise") if wide else MASKS)
@@ -603,9 +603,9 @@ class History:
     seed: int
 
 
-def draw_history(choose: Choose) -> History:
+def draw_history(choose: Choose, lenses: Sequence[str] = LENSES) -> History:
     """Draw a history."""
-    camera = draw_camera(choose)
+    camera = draw_camera(choose, lenses)
     # Gradients of occlusion are those of dense rendering: too slow here for hundreds of layers, or large PSFs.
     many = camera.lens.startswith("wide") or camera.fidelity.layers in {"cubic", "bandlimited"}
     left_out = WITH_GRADIENTS if camera.compositing == "occlusion" and many else ()
@@ -682,13 +682,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.camera.histories", description="Captures after histories.")
     parser.add_argument("--count", type=int, default=2000, help="histories (default: 2000)")
     parser.add_argument("--seed", type=int, default=0, help="(default: 0)")
+    parser.add_argument("--lenses", nargs="+", default=LENSES, choices=LENSES, help="to draw from (default: all)")
     args = parser.parse_args()
     torch.set_num_threads(1)
     counts: Counter[tuple[str, str]] = Counter()
     nearest: dict[str, float] = {}  # largest share of the bound
     failed = 0
     for number in tqdm(range(args.count)):
-        history = draw_history(random.Random(f"{args.seed} {number}").choice)
+        history = draw_history(random.Random(f"{args.seed} {number}").choice, args.lenses)
         camera = history.camera
         counts.update((("compositing", camera.compositing), ("lens", camera.lens), ("border", camera.border)))
         counts.update((("masks", camera.masks), ("way", history.way), *(("event", event) for event in history.events)))

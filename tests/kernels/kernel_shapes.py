@@ -677,10 +677,12 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
         *sums,
     )
     about = (
-        f"{dtype} exposures {exposures} states {states} cells {cells} patches {patches} points {points} places {places} "
-        f"depths {depths} shifts {shifts} width {width} extent {extent} samples {samples} window {window} wide {wide}"
+        f"{dtype} exposures {exposures} states {states} cells {cells} patches {patches} points {points} "
+        f"places {places} depths {depths} shifts {shifts} width {width} extent {extent} samples {samples} "
+        f"window {window} wide {wide}"
     )
-    products = places * depths * (patches * points * extent**2 + exposures * states * samples * extent * (samples + extent))
+    transforms = exposures * states * samples * extent * (samples + extent)
+    products = places * depths * (patches * points * extent**2 + transforms)
     return case, about, products
 
 

@@ -184,6 +184,17 @@ class TestLensPSFs(BaseTester):
         other = model(lens, turned).psf_bank(defocus=[3.0], field=[(-500.0, -400.0)])
         self.assert_close(other.psfs, one.psfs.rot90(1, (3, 4)), atol=2e-6, rtol=0)
 
+    @torch.no_grad()
+    def test_feature_a_place_has_the_same_bits_whatever_others_are_asked_for(self):
+        """Mirrored places share their points in the stop, and places that are asked for twice do not."""
+        lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=6e-3)
+        field = [(-300.0, 500.0), (0.0, 500.0), (300.0, -500.0), (0.0, 0.0), (300.0, 500.0), (0.0, -500.0), (0.0, 0.0)]
+        for seen in (lens, lens.with_masks_off_stop(20.0)):
+            optics = model(seen, random_mask(7, 2), modulator=DwellTimes((3, 1)))
+            together = optics.psf_bank(defocus=[3.0, -8.0], field=field).psfs
+            for place, psfs in zip(field, together, strict=True):
+                assert torch.equal(optics.psf_bank(defocus=[3.0, -8.0], field=[place]).psfs[0], psfs)
+
     def test_feature_light_falls_as_relative_illumination_tells(self):
         lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=16e-3)
         whole = SMALL.replace(stray_light="renormalize")
