@@ -222,9 +222,9 @@ def field_psfs(
     window: int,
     tolerance: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the PSFs of :func:`field_psf_bank` in parts of the light of their channel, (D, F, C, P, P), and that light.
+    """Return the PSFs of :func:`field_psf_bank` over the light of their channel, (D, F, C, P, P), and that light.
 
-    The light of a channel, that of all planes of its basis of spectra, is (F, D, C), in parts of that on the axis.
+    The light of a channel is that of all planes of its basis of spectra over that on the axis, (F, D, C).
 
     Args:
         phase: this and the other arguments are those of :func:`field_psf_bank`.
