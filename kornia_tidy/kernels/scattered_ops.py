@@ -196,9 +196,9 @@ def _new_light(
     if cosines.ndim != 2 or cosines.shape != sines.shape:
         raise ValueError(f"cosines and sines must have one shape, got {tuple(cosines.shape)} and {tuple(sines.shape)}")
     if rows.ndim != 5 or rows.shape != columns.shape or rows.shape[1::3] != (len(waves), 2 * len(cosines)):
+        wanted = f"(F, {len(waves)}, V, P, {2 * len(cosines)})"
         raise ValueError(
-            f"rows and columns must have shape (F, {len(waves)}, V, P, {2 * len(cosines)}), got {tuple(rows.shape)} and "
-            f"{tuple(columns.shape)}"
+            f"rows and columns must have shape {wanted}, got {tuple(rows.shape)} and {tuple(columns.shape)}"
         )
     return weights.new_empty(len(rows), depths, *rows.shape[1:4], rows.shape[3])
 
