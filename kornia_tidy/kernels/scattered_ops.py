@@ -3,10 +3,10 @@ r"""Operator of the light in the pixels of a sensor from scattered points in the
 .. math:: I_{fdev} = R_{fev} \Big( \sum_k w_k \, |T G_{fdek} T^T|^2 \Big) C_{fev}^T, \qquad
           G_{fdek} = \sum_c u_{ekc} \sum_s a_{fdcs} \, \varphi(y_{fcs}) \, \varphi(x_{fcs})^T
 
-The points s of a patch c of the stop share the wave u of a cell, which differs between exposures e. They lie at (y, x) on
-a grid, on which a kernel :math:`\varphi` spreads them. T transforms the grid to samples on the sensor along either axis,
-R and C sum samples to pixels. The gradients of waves and weights are also computed in C; gradients of gradients come from
-the same in torch.
+The points s of a patch c of the stop share the wave u of a cell, which differs between exposures e. They lie at (y, x)
+on a grid, on which a kernel :math:`\varphi` spreads them. T transforms the grid to samples on the sensor along either
+axis, R and C sum samples to pixels. The gradients of waves and weights are also computed in C; gradients of gradients
+come from the same in torch.
 """
 
 from __future__ import annotations
