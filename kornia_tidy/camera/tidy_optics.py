@@ -414,6 +414,8 @@ class TiDyOptics(CameraState):
     def explain(self, image: Tensor, depth: Tensor) -> Explanation:
         """Return which backend renders a scene, of several pieces the first, with operations and memory of each.
 
+        PSFs that vary over the picture are those of its place; of a batch with several places, of the first image's.
+
         Args:
             image: (B, C, H, W) or (C, H, W), as for a capture.
             depth: its depth.
@@ -432,7 +434,9 @@ class TiDyOptics(CameraState):
             raise ValueError("an explanation needs at least one image, got a batch of none")
         light, defocus = self.decode(sample.image.to(sample.dtype)), self.defocus(sample.depth.to(sample.dtype))
         reach, (batch, channels, height, width) = defocus_extremes([defocus], self), light.shape
-        given = self.compositing, self.memory_budget, defocus
+        center = sample.centers[0] if sample.centers else self.field_center
+        field = self.psf_model.field_of((height, width), center)
+        given = self.compositing, self.memory_budget, defocus, light.device, field
         pieces = list(pieces_of(self.psf_model, channels, sample.dtype, reach, *given))
         if pieces[0].window is not None:
             if self.border == "valid":
@@ -442,14 +446,12 @@ class TiDyOptics(CameraState):
             words = f"gather of {batch} x {channels} channels of {height}x{width} px, layers of wide blur: {groups}"
             return Explanation(words, "grids", {}, {})
         bank, fidelity = pieces[0].bank(), self.psf_model.fidelity
-        light = light.repeat(1, bank.psfs.shape[1] // channels, 1, 1)
+        light = light.repeat(1, bank.psfs.shape[-3] // channels, 1, 1)
         how = self.compositing, "nearest" if fidelity.layers == "nearest" else "linear", self.border, fidelity.correlate
-        field, psfs = None, bank.psfs
-        if self.lens is not None and self.compositing != "occlusion":  # PSFs' values cost nothing
-            center = sample.centers[0] if sample.centers else self.field_center
-            if (field := self.psf_model.field_of((height, width), center)) is not None:
-                psfs = psfs.expand(len(field.points), *psfs.shape)
-        found = explain(layered_scene(light, defocus, bank.defocus, psfs, bank.veil, *how, field))
+        psfs, spread = bank.psfs, None if field is not None else bank.veil  # over a field it is added afterwards
+        if field is not None and field.nodes == (1, 1) and self.compositing != "occlusion":
+            field, psfs = None, psfs[0]
+        found = explain(layered_scene(light, defocus, bank.defocus, psfs, spread, *how, field))
         return found if len(pieces) == 1 else replace(found, scene=f"{found.scene}, the first of {len(pieces)} pieces")
 
     # ------------------------------------------------------------------ training, data sets, people

@@ -23,6 +23,7 @@ from kornia_tidy.figures.style import (
 )
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
+from kornia_tidy.psf.field_bank import FieldBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,6 +46,7 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
 
     Raises:
         ImportError: if matplotlib is missing.
+        TypeError: if the PSFs are those of several places.
 
     Convention:
         - Far is left. PSFs are drawn with the square root of their light, each scaled to its brightest value; colour
@@ -55,6 +57,8 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
     require_matplotlib()
     from matplotlib.figure import Figure  # noqa: PLC0415
 
+    if isinstance(measured.bank, FieldBank):
+        raise TypeError("PSFs of one place are drawn, got those of several: draw the measurement of each place")
     count = len(measured.distances)
     columns = torch.linspace(0, count - 1, min(count, MOST_COLUMNS)).round().long().tolist()
     psfs = measured.bank.psfs.cpu()

@@ -141,7 +141,7 @@ def check_capture(system: TrainedSystem, path: str, capture: CaptureLight) -> No
         ValueError: if it has other colours than the PSFs, or a closed form lacks its noise.
     """
     measured, colors = system.optics.psf_model.measured, len(capture.light)
-    if measured is not None and colors != (channels := measured.psfs.shape[1]):
+    if measured is not None and colors != (channels := measured.psfs.shape[-3]):
         raise ValueError(f"the PSFs were measured in {channels} colours, and {path} has {colors}")
     if capture.noise is None and not system.step:
         raise ValueError(f"the noise of {path} is not known: give --noise")

@@ -137,6 +137,26 @@ class BankOfPSFs:
         kept = {k: mixed(value) for k, value in self.present().items() if k not in ("defocus", "field")}
         return replace(self, defocus=wanted.to(self.defocus), **kept)
 
+    def with_channels(self, channels: int) -> Self:
+        """Return the PSFs of one channel for three colours, or green of three for one channel.
+
+        Args:
+            channels: 1 or 3.
+
+        Raises:
+            ValueError: if they are of another number of channels, or another one is asked for.
+
+        Example:
+            >>> PSFBank.from_measured(torch.rand(2, 1, 5, 5), torch.arange(2.0)).with_channels(3).psfs.shape
+            torch.Size([2, 3, 5, 5])
+        """
+        chosen = {(1, 3): [0, 0, 0], (3, 1): [1]}.get((own := self.psfs.shape[-3], channels), list(range(own)))
+        if len(chosen) != channels:
+            raise ValueError(f"PSFs of {channels} channels are needed, got {own}")
+        held = {k: value for k, value in self.present().items() if k not in ("defocus", "field")}
+        axis, kept = len(self.axes) - 1, torch.tensor(chosen, device=self.psfs.device)
+        return replace(self, **{k: value.index_select(axis, kept) for k, value in held.items()})
+
     def save(
         self,
         path: str | os.PathLike[str],
@@ -201,24 +221,6 @@ class PSFBank(BankOfPSFs):
 
     energy: Tensor
     veil: Tensor | None = None
-
-    def with_channels(self, channels: int) -> PSFBank:
-        """Return the PSFs of one channel for three colours, or green of three for one channel.
-
-        Args:
-            channels: 1 or 3.
-
-        Raises:
-            ValueError: if they are of another number of channels, or another one is asked for.
-
-        Example:
-            >>> PSFBank.from_measured(torch.rand(2, 1, 5, 5), torch.arange(2.0)).with_channels(3).psfs.shape
-            torch.Size([2, 3, 5, 5])
-        """
-        chosen = {(1, 3): [0, 0, 0], (3, 1): [1]}.get((own := self.psfs.shape[1], channels), list(range(own)))
-        if len(chosen) != channels:
-            raise ValueError(f"PSFs of {channels} channels are needed, got {own}")
-        return replace(self, **{k: value[:, chosen] for k, value in self.present().items() if k != "defocus"})
 
     @classmethod
     def from_measured(cls, psfs: Tensor, defocus: Tensor) -> PSFBank:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_float_tensor, check_positive
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
@@ -95,8 +96,10 @@ class LightHead(nn.Module):
         self.camera = cast("ThinLensCamera", system.optics.camera)  # another one where no depth is estimated
         self.encoded = system.optics.color_space == "srgb"
         self.uncertain = system.settings.depth_classes > 0
-        behind = system.settings.head in CLOSED_FORMS and system.optics.psf_model.varies
-        self.field = (system.optics.psf_model, system.optics.field_center) if behind else None  # no part of the head
+        model, behind = system.optics.psf_model, system.settings.head in CLOSED_FORMS
+        if isinstance(model.measured, FieldBank):
+            model = model.with_bank(model.measured.with_channels(3))
+        self.field = (model, system.optics.field_center) if behind and model.varies else None  # no part of the head
         self.eval()
 
     def forward(self, light: Tensor) -> tuple[Tensor, ...]:

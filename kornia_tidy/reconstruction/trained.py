@@ -175,8 +175,10 @@ def closed_form_bank(optics: TiDyOptics, layers: int = 0) -> PSFBank:
 def _psf_bank(optics: TiDyOptics, channels: int, nodes: list[float]) -> PSFBank:
     """Return a camera's PSFs for 1 channel, green, or 3; measured ones of the one number serve for the other."""
     measured = optics.psf_model.measured
-    if measured is None or isinstance(measured, FieldBank):
+    if measured is None:
         return optics.psf_bank(channels, defocus=nodes)
+    if isinstance(measured, FieldBank):
+        measured = measured.at_places([(0.0, 0.0)]).at(0)
     return measured.to(optics.masks.phase.device).at_defocus(nodes).with_channels(channels)
 
 

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from kornia_tidy import PSFBank, SensorNoise, ThinLensCamera
+from kornia_tidy.figures.measured_psfs import draw_measured
+from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
 from kornia_tidy.lab.capture_file import CaptureLight
 from kornia_tidy.lab.measured import (
     check_capture,
@@ -18,6 +20,7 @@ from kornia_tidy.lab.measured import (
 )
 from kornia_tidy.psf import FieldBank
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
+from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, load_trained, update_psfs
@@ -68,6 +71,36 @@ class TestClosedFormSystem(BaseTester):
         for place in ((0.0, 0.0), (0.0, 300.0)):
             seen = [one.optics(image, depth, field_center=place) for one in (system, again)]
             assert torch.equal(*seen)
+
+    @pytest.mark.parametrize("channels", [1, 3])
+    @torch.no_grad()
+    def test_feature_a_file_of_several_places(self, channels, tmp_path):
+        """Read as that of one place is; a capture is restored by the PSFs of its place."""
+        one = measured_psfs(channels)
+        reports = tuple(PointReport(place, 0.0, 0.0, 1.0, 1.0, None) for place in one.distances.tolist())
+        one = replace(one, reports=reports)
+        far = replace(one, bank=replace(one.bank, psfs=one.bank.psfs.roll(3, -1)))  # moves light by 3 px
+        MeasuredPSFs.over_field([one, far], [(0, -9), (0, 9)]).save(tmp_path / "field.safetensors")
+        both = MeasuredPSFs.load(tmp_path / "field.safetensors")
+        assert both.camera.focal_length == LENS.focal_length
+        assert torch.equal(both.distances, one.distances)
+        assert [words.split(":")[0] for _, words in both.in_words()] == [w.split(":")[0] for _, w in one.in_words()]
+        capture = torch.rand(channels, 24, 24, generator=torch.Generator().manual_seed(0))
+        restored = []
+        for psfs, center in ((both, -300.0), (both, 300.0), (one, 0.0), (far, 0.0)):
+            system = closed_form_system(psfs, SENSOR, "tikhonov")
+            system.optics.field_center = 0.0, center
+            restored.append(reconstruct_light(LightHead(system, noise=2e-3), capture).image)
+        self.assert_close(restored[0], restored[2], rtol=0, atol=1e-4)
+        self.assert_close(restored[1], restored[3], rtol=0, atol=1e-4)
+        assert float((restored[0] - restored[1]).abs().max()) > 0.1
+
+    def test_exception_of_several_places(self, psfs):
+        other = replace(psfs, bank=replace(psfs.bank, defocus=psfs.bank.defocus + 1))
+        with pytest.raises(ValueError, match="banks of all places must have the same defocus, colours and window"):
+            MeasuredPSFs.over_field([psfs, other], [(0, 0), (0, 9)])
+        with pytest.raises(TypeError, match="PSFs of one place are drawn"):
+            draw_measured(MeasuredPSFs.over_field([psfs, psfs], [(0, 0), (0, 9)]))
 
     def test_exception_a_checkpoint_whose_psfs_do_not_fit(self, psfs, tmp_path):
         system = closed_form_system(psfs, SENSOR)

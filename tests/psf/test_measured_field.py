@@ -106,6 +106,19 @@ class TestMeasuredField(BaseTester):
             errors.append(float((scaled - image)[..., :40, :40].square().mean()))
         assert errors[0] < errors[1]
 
+    @torch.no_grad()
+    def test_feature_an_explanation_is_of_the_place(self):
+        """Its nodes are those of a capture there; beyond the measured places PSFs do not change."""
+        (image, depth), bank = scene(64, 72), measured(center=(0.0, 0.0))
+        found = []
+        for center in ((0.0, 0.0), (200.0, 250.0)):
+            optics = camera(field_center=center).with_bank(bank)
+            nodes = optics.psf_model.field_of((64, 72), center).nodes
+            words = optics.explain(image, depth).scene
+            assert (f" at {nodes[0]}x{nodes[1]} places over the picture" in words) == (nodes != (1, 1))
+            found.append(nodes)
+        assert found[0] != found[1]
+
     def test_feature_gradients_and_the_transpose(self):
         optics, (image, depth) = camera().with_bank(measured()), scene(64, 72)
         operator, image = LinearCamera(optics, depth), image.double()

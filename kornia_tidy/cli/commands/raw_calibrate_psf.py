@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from kornia_tidy.cli.commands.parser import Given
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
@@ -16,6 +16,7 @@ from kornia_tidy.settings import Count, Metres, Seconds, Unit
 if TYPE_CHECKING:
     from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.lab.calibration.psf.point_files import Picture
+    from kornia_tidy.psf.psf_bank import PSFBank
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +134,8 @@ In Python:
             from kornia_tidy.lab.calibration.psf.phase_retrieval import retrieve_mask, spectrum_of
             from kornia_tidy.lab.mask_export.mask_files import write_heights
 
-            fit = retrieve_mask(measured.bank, camera, spectrum_of(channels), self.mask_size)
+            bank = cast("PSFBank", measured.bank)  # of one place
+            fit = retrieve_mask(bank, camera, spectrum_of(channels), self.mask_size)
             for distance, left in zip(measured.distances, fit.residual, strict=True):
                 words = " ".join(f"{100 * float(x):.2g}" for x in left)
                 tell("mask", f"{float(distance):g} m: leaves {words} % in L1")

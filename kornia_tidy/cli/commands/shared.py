@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
     from kornia_tidy.masks.pixelwise import PixelwiseMask
     from kornia_tidy.optics.thin_lens import ThinLensCamera
+    from kornia_tidy.psf.field_bank import FieldBank
     from kornia_tidy.psf.psf_bank import PSFBank
     from kornia_tidy.sensor.sensor import SensorNoise
 
@@ -276,7 +277,9 @@ def read_noise(given: float | str | None) -> tuple[SensorNoise | None, PhotonTra
     return measured.sensor_noise(), measured
 
 
-def measured_system(psfs: str | None, noise: float | str | None, given: Iterable[str]) -> tuple[dict, PSFBank | None]:
+def measured_system(
+    psfs: str | None, noise: float | str | None, given: Iterable[str]
+) -> tuple[dict, PSFBank | FieldBank | None]:
     """Return the settings of the camera that --psfs and --noise say, and the measured PSFs, if any.
 
     Args:

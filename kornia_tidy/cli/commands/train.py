@@ -15,6 +15,7 @@ from kornia_tidy.settings import Count, Processes, Unit, one_of
 from kornia_tidy.training.settings import LEARN, NETWORK_RUN, TrainingSettings, usual_settings
 
 if TYPE_CHECKING:
+    from kornia_tidy.psf.field_bank import FieldBank
     from kornia_tidy.psf.psf_bank import PSFBank
 
 CURVE = "learning_curve.png"
@@ -194,7 +195,7 @@ Defaults of --learn network, which are for a CPU:
         for name in (LAST, SETTINGS, "training.csv", "validation.csv", *drawn, "pictures"):
             say("", str(folder / name))
 
-    def _settings(self, stored: Path) -> tuple[TrainingSettings, PSFBank | None]:
+    def _settings(self, stored: Path) -> tuple[TrainingSettings, PSFBank | FieldBank | None]:
         """Return the settings of the run: stored ones with the given changes, or usual ones; and measured PSFs."""
         from kornia_tidy.training.design_folder import designed_settings
 

@@ -83,6 +83,19 @@ class TestRawReconstruct(BaseTester):
         assert record["psfs"] == "measured: bank.safetensors"
         assert record["noise"] == sensor.extra_repr()
 
+    def test_feature_what_was_measured_at_several_places(self, here):
+        """Alike in both: as at one place. The other commands read the file as this one and simulate do."""
+        one = MeasuredPSFs.load("bank.safetensors")
+        MeasuredPSFs.over_field([one, one], [(0, 0), (0, 40)]).save("field.safetensors")
+        found = []
+        for file in ("bank.safetensors", "field.safetensors"):
+            words = ["shot.dng", "--head", "tikhonov", "--psfs", file, *NOISE]
+            assert main(["raw", "reconstruct", *words, "-o", file[:4]]) == 0
+            assert main(["simulate", "scene.png", *SCENE, "--psfs", file, "-o", f"{file[:4]}.png"]) == 0
+            found.append((read_image(f"{file[:4]}/shot.png"), read_image(f"{file[:4]}.png")))
+        for one_place, several in zip(*found, strict=True):
+            self.assert_close(one_place, several, rtol=0, atol=2 / 255)
+
     def test_feature_a_network_is_told_and_pictures_are_taken_too(self, here):
         checkpoint(here / "mine.safetensors", task="edof", closed_form=True, **LENS)
         named = ["raw", "reconstruct", "shot.dng", "--head", "mine.safetensors"]

@@ -8,7 +8,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -31,6 +31,7 @@ from kornia_tidy.lab.calibration.psf.shrinkage import shrink
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
 from kornia_tidy.tensor_files import read_tensors
@@ -71,19 +72,21 @@ class PointReport:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPSFs:
-    """PSFs measured over depth.
+    """PSFs measured over depth, at one place of the picture or at several.
 
     Args:
-        bank: the PSFs, each summing to one. Light outside the window was not measured and is ignored.
-        uncertainty: (D, C, P, P) standard deviation of each value: from the noise and the scatter of the captures, the
-            background, the light around the window, the position and the diameter of the point. The truth lies within
-            1.96 of it for 95 % of the values; docs/calibration.md has figures, and says what no capture reveals.
+        bank: the PSFs, each summing to one. Light outside the window was not measured and is ignored. Of several
+            places, see :meth:`over_field`, a :class:`~kornia_tidy.psf.FieldBank`.
+        uncertainty: (D, C, P, P), or with a field (F, D, C, P, P): standard deviation of each value: from the noise
+            and the scatter of the captures, the background, the light around the window, the position and the diameter
+            of the point. The truth lies within 1.96 of it for 95 % of the values; docs/calibration.md has figures, and
+            says what no capture reveals.
         distances: (D,) distance in metres of each node of the bank, from far to near.
         reports: one for each point image.
         camera: the lens, which turns distance into defocus. None if unknown, as of files of earlier versions.
     """
 
-    bank: PSFBank
+    bank: PSFBank | FieldBank
     uncertainty: Tensor
     distances: Tensor
     reports: tuple[PointReport, ...] = ()
@@ -95,8 +98,40 @@ class MeasuredPSFs:
             raise ValueError(
                 f"uncertainty must have the shape of the PSFs, {shape}, got {tuple(self.uncertainty.shape)}"
             )
-        if tuple(self.distances.shape) != shape[:1]:
-            raise ValueError(f"distances must have shape ({shape[0]},), one a PSF, got {tuple(self.distances.shape)}")
+        if self.distances.shape != self.bank.defocus.shape:
+            raise ValueError(
+                f"distances must have shape ({len(self.bank.defocus)},), one a PSF, got {tuple(self.distances.shape)}"
+            )
+
+    @classmethod
+    def over_field(
+        cls,
+        measured: Sequence[MeasuredPSFs],
+        field: Sequence[tuple[float, float]],
+        light: Sequence[float] | None = None,
+    ) -> MeasuredPSFs:
+        """Return the measurement of a camera at several places of its picture, whose file ``--psfs`` takes.
+
+        Args:
+            measured: of each place, at the same distances.
+            field: the places, y and x in sensor pixels from the lens's axis.
+            light: of an even scene at each place over that on the axis. Default: 1, no vignetting.
+
+        Raises:
+            TypeError: if the places are not numbers.
+            ValueError: if there is not one place for each measurement, or they differ in distances, colours or window.
+
+        Example:
+            >>> camera, distances = ThinLensCamera(depth_range=(0.5, 0.8)), torch.tensor([0.8, 0.5])
+            >>> bank = PSFBank.from_measured(torch.rand(2, 3, 5, 5), camera.defocus(distances))
+            >>> one = MeasuredPSFs(bank, torch.zeros(2, 3, 5, 5), distances, camera=camera)
+            >>> MeasuredPSFs.over_field([one, one], [(0, 0), (300, 400)]).bank.psfs.shape
+            torch.Size([2, 2, 3, 5, 5])
+        """
+        bank = FieldBank.from_measured([cast("PSFBank", one.bank) for one in measured], field, light)
+        uncertainty = torch.stack([one.uncertainty for one in measured]) * bank.light[..., None, None]
+        reports = tuple(report for one in measured for report in one.reports)
+        return cls(bank, uncertainty, measured[0].distances, reports, measured[0].camera)
 
     def known_camera(self) -> ThinLensCamera:
         """Return the lens.
@@ -112,7 +147,7 @@ class MeasuredPSFs:
         return self.camera
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the measurement as a safetensors file, whose bank :meth:`PSFBank.load` reads.
+        """Write the measurement as a safetensors file, whose bank the ``load`` of its class reads.
 
         Args:
             path: file to write; after an error no partial file remains.
@@ -138,8 +173,8 @@ class MeasuredPSFs:
             FileNotFoundError: if the file is missing.
             ValueError: if the file is not a PSF bank, or a bank that was not measured.
         """
-        bank = PSFBank.load(path, device)
         found, notes = read_tensors(path, "PSF bank", device)
+        bank = (FieldBank if notes.get("format") == FieldBank.form else PSFBank).load(path, device)
         names = [name for name in ("measured.uncertainty", "measured.distances") if name in found]
         tensors: dict[str, Any] = {name.removeprefix("measured."): found[name] for name in names}
         try:
@@ -156,7 +191,8 @@ class MeasuredPSFs:
             for r in self.reports
             if r.rejected is not None
         ]
-        noise = (2 / torch.pi) ** 0.5 * self.uncertainty.sum((2, 3))
+        noise = (2 / torch.pi) ** 0.5 * self.uncertainty.sum((-2, -1))
+        noise = noise if noise.ndim == 2 else noise.amax(0)  # of the worst place
         for distance, psi, own in zip(self.distances, self.bank.defocus, noise, strict=True):
             used = [r for r in self.reports if r.distance == float(distance) and r.rejected is None]
             times = (sum(r.misfit or 0.0 for r in used) / len(used)) ** 0.5
