@@ -2,9 +2,9 @@
 
 ``python -m tests.accuracy.plan_campaign 0 1000`` plans a thousand scenes, takes the captures of both plan and
 reference, and prints how many errors were beyond the tolerance asked, and the largest. A third of the lenses blur
-widely: they are fast and without a mask. Where rays are planned the reference is a
-PSF of its own for each depth. Each seed is a trial,
-so a range can be cut in pieces; ``--record`` keeps every outcome.
+widely: they are fast and without a mask. Where rays are planned the reference is a PSF of its own for each depth. With
+``--real`` all cameras have a real lens, somewhere in its field, and the reference has places for a tolerance of 1e-3.
+Each seed is a trial, so a range can be cut in pieces; ``--record`` keeps every outcome.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -27,7 +28,7 @@ from torch import Tensor, nn
 from kornia_tidy import DefocusRange, DwellTimes, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
 from kornia_tidy.accuracy import psf_samples
 from kornia_tidy.accuracy.candidates import REFERENCE
-from kornia_tidy.accuracy.plan import plan_scene
+from kornia_tidy.accuracy.plan import LEAST_TOLERANCE, plan_scene
 from kornia_tidy.accuracy.render_plan import RenderPlan
 from kornia_tidy.masks import (
     CubicMask,
@@ -40,7 +41,7 @@ from kornia_tidy.masks import (
     ZernikeMask,
 )
 from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, SpatialLightModulator
-from kornia_tidy.optics import camera_spectrum
+from kornia_tidy.optics import Lens, camera_spectrum
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.render.borders import cropped
@@ -70,6 +71,12 @@ MASKS: dict[str, Masks] = {
     "Fresnel": lambda g: FresnelLens(10.0),
     "strong Fresnel": lambda g: FresnelLens(40.0),
 }
+REAL = {
+    "double-gauss-50mm": (8.0, 17.6),
+    "triplet-50mm": (8.0, 16.0),
+    "single-50mm": (11.0, 17.6),
+    "phone-5.5mm": (5.6,),
+}
 FLAT = ("flat", "flat", "none")
 APERTURES: dict[str, Callable[[int, torch.Generator], Tensor | None]] = {
     "default": lambda n, g: None,
@@ -98,7 +105,7 @@ class Trial:
 
     Args:
         seed: of everything drawn.
-        wide: whether the lens is a fast one without a mask.
+        lenses: kind of the lens: "real", "wide" for a fast one without a mask, or "other".
         drawn: what was drawn, by name.
         tolerance: root mean square error asked, full scale 1.
         predicted: error of the plan.
@@ -107,7 +114,7 @@ class Trial:
     """
 
     seed: int
-    wide: bool
+    lenses: str
     drawn: dict[str, Any]
     tolerance: float
     predicted: float
@@ -120,24 +127,26 @@ class Trial:
         return self.measured / self.tolerance
 
 
-def trial(seed: int) -> Trial:
+def trial(seed: int, real: bool = False) -> Trial:
     """Draw a camera and a scene, plan, and compare the capture with that of the reference."""
     g = torch.Generator().manual_seed(seed)
-    wide, (optics, drawn) = seed % 3 == 2, _wide_camera(g) if seed % 3 == 2 else _camera(g)
-    light, defocus, kind = _scene(optics, wide, g)
+    lenses = "real" if real else "wide" if seed % 3 == 2 else "other"
+    optics, drawn = {"real": _real_camera, "wide": _wide_camera, "other": _camera}[lenses](g)
+    light, defocus, kind = _scene(optics, lenses, g)
     drawn |= {"scene": kind, "size": list(light.shape[-2:])}
-    tolerance = _one(TOLERANCES, g)
+    tolerance = _one(TOLERANCES[: 4 if real else 5], g)  # places of a field keep to no less
     with warnings.catch_warnings(), patch.object(psf_samples, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
         warnings.simplefilter("ignore")  # that windows this narrow do not hold the light they should
         plan = plan_scene(optics, defocus, light, light.shape[:2], tolerance)
         measured = (_ray_error if plan.fidelity.window is None else _error)(optics, light, defocus, plan)
-    return Trial(seed, wide, drawn, tolerance, plan.predicted_error, measured, plan.fidelity.name)
+    return Trial(seed, lenses, drawn, tolerance, plan.predicted_error, measured, plan.fidelity.name)
 
 
 def _error(optics: TiDyOptics, light: Tensor, defocus: Tensor, plan: RenderPlan) -> float:
     if plan.fidelity.replace(name="") == plan.reference.replace(name=""):
         return 0.0
-    return Rig(optics).error(light, defocus, plan.fidelity, plan.reference)
+    reference = plan.reference if optics.lens is None else plan.reference.replace(field_tolerance=LEAST_TOLERANCE)
+    return Rig(optics).error(light, defocus, plan.fidelity, reference)
 
 
 @torch.no_grad()
@@ -236,9 +245,41 @@ def _wide_camera(g: torch.Generator) -> tuple[TiDyOptics, dict[str, Any]]:
     return optics, {"compositing": "gather", "border": border, **names, "defocus": span, "step": step}
 
 
-def _scene(optics: TiDyOptics, wide: bool, g: torch.Generator) -> tuple[Tensor, Tensor, str]:
+def _real_camera(g: torch.Generator) -> tuple[TiDyOptics, dict[str, Any]]:
+    compositing, border, kind = _one(COMPOSITINGS, g), _one(BORDERS, g), _one(sorted(MASKS), g)
+    masks = MASKS[kind](g)
+    name = _one(sorted(REAL), g)
+    number, pitch = _one(REAL[name], g), _between(3e-6, 9e-6, g)
+    lens = _named(name, number)
+    phase_of_one_per_metre = math.pi * (lens.focal_length / (2 * number)) ** 2 / REFERENCE_WAVELENGTH
+    ends = [1 / lens.focus_distance + psi / phase_of_one_per_metre for psi in (_between(1, 15, g), -_between(1, 15, g))]
+    camera = lens.camera(pitch, (1 / ends[0], 1 / ends[1] if ends[1] > 0 else math.inf))
+    turn, height = _between(0, 2 * math.pi, g), _between(0, 0.9, g) * float(lens.table.field[0]) / pitch
+    optics = TiDyOptics(
+        masks,
+        camera,
+        sensor=None,
+        fidelity=REFERENCE.replace(window=3),
+        compositing=compositing,
+        border=border,
+        lens=lens,
+        field_center=(height * math.sin(turn), height * math.cos(turn)),
+    )
+    names = {"lens": name, "f_number": number, "masks": kind, "pitch": pitch, "height": height}
+    span = [round(psi, 3) for psi in camera.defocus_range]
+    return optics, {"compositing": compositing, "border": border, **names, "defocus": span}
+
+
+@lru_cache
+def _named(name: str, f_number: float) -> Lens:
+    return Lens.named(name, f_number, 0.6)
+
+
+def _scene(optics: TiDyOptics, lenses: str, g: torch.Generator) -> tuple[Tensor, Tensor, str]:
+    wide = lenses == "wide"
     kind = _one(sorted(set(SCENES) - {"tiny"}) if wide else sorted(SCENES), g)
-    sides = (1, 2, 3, 5, 8, 13) if kind == "tiny" else (40, 48, 63) if wide else (33, 40, 48, 63)
+    sides = (40, 48, 63) if wide else (33, 40, 48, 127) if lenses == "real" else (33, 40, 48, 63)
+    sides = (1, 2, 3, 5, 8, 13) if kind == "tiny" else sides
     size = _one(sides, g), _one(sides, g)
     if wide and optics.border == "valid":
         size = size[0] + optics.window, size[1] + optics.window
@@ -257,14 +298,14 @@ def _scene(optics: TiDyOptics, wide: bool, g: torch.Generator) -> tuple[Tensor, 
 def report(trials: Sequence[Trial]) -> str:
     """Return how many plans were beyond their tolerance, and the largest errors, for wide lenses and for others."""
     lines = []
-    for wide in (True, False):
-        own = sorted((each for each in trials if each.wide == wide), key=lambda each: -each.ratio)
+    for lenses in ("wide", "real", "other"):
+        own = sorted((each for each in trials if each.lenses == lenses), key=lambda each: -each.ratio)
         if not own:
             continue
         beyond = sum(each.ratio > 1 for each in own)
         reference = sum(each.measured == 0 for each in own)
         lines.append(
-            f"{'wide lenses' if wide else 'other lenses'}: {len(own)} plans, {beyond} beyond the tolerance, "
+            f"{lenses} lenses: {len(own)} plans, {beyond} beyond the tolerance, "
             f"{reference} are the reference, worst {own[0].ratio:.3f} of the tolerance"
         )
         lines += [f"  {each}" for each in own if each.ratio > 1] or [f"  {own[0]}"]
@@ -276,13 +317,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("first", type=int)
     parser.add_argument("beyond", type=int)
+    parser.add_argument("--real", action="store_true", help="cameras with a real lens")
     parser.add_argument("--record", type=Path, help="file that a line of JSON is added to for each trial")
     options = parser.parse_args()
     torch.set_num_threads(1)
     start, trials = time.process_time(), []
     for seed in range(options.first, options.beyond):
         began = time.process_time()
-        trials.append(trial(seed))
+        trials.append(trial(seed, options.real))
         if options.record:
             line = {**asdict(trials[-1]), "seconds": round(time.process_time() - began, 2)}
             with options.record.open("a") as file:
