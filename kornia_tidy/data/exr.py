@@ -224,7 +224,7 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
 def _unclear(reason: str, channels: Sequence[_Channel]) -> ValueError:
     """Return the error for a file with an ambiguous depth."""
     return ValueError(
-        f"which channel of its OpenEXR is depth is not clear, {reason}: write only one of {_listed(channels)} to a file"
+        f"which channel of its OpenEXR is depth is not clear, {reason}: of {_listed(channels)} write only one to a file"
     )
 
 
