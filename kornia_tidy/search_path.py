@@ -20,6 +20,17 @@ from typing import Any
 ROOT = os.path.abspath(os.sep)  # working folder of processes that need none
 _STANDARD = os.path.dirname(os.path.abspath(os.__file__))
 _SAFE = "PYTHONSAFEPATH"  # a process with this in its environment does not put the current folder on its path
+EXTRAS = {
+    "OpenEXR": "exr",
+    "gradio": "app",
+    "h5py": "data",
+    "huggingface_hub": "hub",
+    "lightning": "train",
+    "matplotlib": "plot",
+    "tensorboard": "train",
+    "transformers": "baselines",
+}
+"""Extras of this package that install others; further packages are installed by their own names."""
 _LOCK = RLock()  # sys.path and the environment belong to the process, so one thread at a time changes them
 try:
     _START = os.getcwd()  # an absolute entry of the path with -m, and for "." in PYTHONPATH
@@ -46,6 +57,47 @@ def import_installed(name: str) -> Any:
         finally:
             before += [entry for entry in sys.path if entry not in before]  # a package may have added folders
             sys.path = before
+
+
+def import_extra(name: str, user: str) -> Any:
+    """Import a module of a package that only some users need, as :func:`import_installed` does.
+
+    Args:
+        name: of the module.
+        user: needs the package, for the message.
+
+    Raises:
+        ImportError: if it cannot be imported, with the line that installs it.
+
+    Example:
+        >>> import_extra("zlib", "a compressed file").crc32(b"")
+        0
+    """
+    try:
+        return import_installed(name)
+    except (ImportError, RuntimeError) as error:
+        raise missing(name, user, error) from None
+
+
+def missing(name: str, user: str, error: Exception) -> ImportError:
+    """Return the error for a module that cannot be imported, with the line that installs its package.
+
+    Args:
+        name: of the module.
+        user: needs the package, for the message.
+        error: of the import. It is told unless it says that the package is not installed.
+
+    Example:
+        >>> missing("matplotlib.figure", "a picture", ModuleNotFoundError(name="matplotlib"))
+        ImportError("a picture needs matplotlib: pip install 'kornia-tidy[plot]'")
+        >>> missing("torchvision", "Depth", RuntimeError("operator torchvision::nms does not exist"))
+        ImportError('Depth needs torchvision: pip install torchvision (operator torchvision::nms does not exist)')
+    """
+    package = name.partition(".")[0]
+    line = f"'kornia-tidy[{EXTRAS[package]}]'" if package in EXTRAS else package
+    absent = isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] == package
+    reason = "" if absent else f" ({error})"
+    return ImportError(f"{user} needs {package}: pip install {line}{reason}")
 
 
 def package_folders(*names: str) -> list[str]:

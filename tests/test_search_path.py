@@ -6,11 +6,18 @@ import os
 import subprocess
 import sys
 from contextlib import suppress
+from importlib import import_module
 from importlib.util import find_spec
 
 import pytest
 
-from kornia_tidy.search_path import find_program, import_installed
+from kornia_tidy.data.exr import decode_exr
+from kornia_tidy.data.hdf5 import decode_hdf5
+from kornia_tidy.figures.style import require_matplotlib
+from kornia_tidy.reconstruction.baselines import load_zoedepth
+from kornia_tidy.reconstruction.hub import from_pretrained
+from kornia_tidy.search_path import find_program, import_extra, import_installed
+from kornia_tidy.training.lightning_extra import require_lightning
 from tests.base import BaseTester
 
 
@@ -64,3 +71,43 @@ class TestSearchPath(BaseTester):
         monkeypatch.setenv("PATH", "downloads")
         with pytest.raises(FileNotFoundError, match="no program git in the folders of PATH"):
             find_program("git")
+
+
+ADAPTERS = ("torchvision_v2", "albumentations_v2", "deepinv_physics")
+
+
+def importing(name):
+    return lambda: import_module(f"kornia_tidy.{name}")
+
+
+class TestExtras(BaseTester):
+    @pytest.mark.parametrize(
+        ("module", "use", "line"),
+        [
+            ("matplotlib.figure", require_matplotlib, "'kornia-tidy[plot]'"),
+            ("lightning.pytorch", require_lightning, "'kornia-tidy[train]'"),
+            ("tensorboard", require_lightning, "'kornia-tidy[train]'"),
+            ("transformers", lambda: load_zoedepth("a"), "'kornia-tidy[baselines]'"),
+            ("huggingface_hub", lambda: from_pretrained("nobody/nothing"), "'kornia-tidy[hub]'"),
+            ("h5py", lambda: decode_hdf5(b""), "'kornia-tidy[data]'"),
+            ("OpenEXR", lambda: decode_exr(b""), "'kornia-tidy[exr]'"),
+            ("gradio", importing("cli.app.page"), "'kornia-tidy[app]'"),
+            ("torchvision", importing("augmentation.torchvision_v2"), "torchvision"),
+            ("albumentations", importing("augmentation.albumentations_v2"), "albumentations"),
+            ("deepinv.physics", importing("augmentation.deepinv_physics"), "deepinv"),
+        ],
+    )
+    def test_exception_each_package_that_is_missing_gets_the_line_to_type(self, module, use, line, monkeypatch):
+        for name in ("cli.app.page", *(f"augmentation.{name}" for name in ADAPTERS)):
+            monkeypatch.delitem(sys.modules, f"kornia_tidy.{name}", raising=False)
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ImportError) as caught:
+            use()
+        package = module.partition(".")[0]
+        assert f" needs {package}: pip install {line}" in str(caught.value)
+
+    def test_exception_a_fault_of_an_installed_package_is_told(self, tmp_path, monkeypatch):
+        (tmp_path / "faulty.py").write_text("raise RuntimeError('operator nms does not exist')")
+        monkeypatch.syspath_prepend(tmp_path)
+        with pytest.raises(ImportError, match=r"needs faulty: pip install faulty \(operator nms does not exist\)"):
+            import_extra("faulty", "a test")

@@ -18,6 +18,7 @@ from kornia_tidy.augmentation.depth_augmentation import checked_optics
 from kornia_tidy.camera.holes import both_valid, fills_holes
 from kornia_tidy.checks import check_choice, unmasked
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.search_path import missing
 
 try:
     import albumentations as A  # ty: ignore[import-not-found]
@@ -25,7 +26,7 @@ try:
         BaseTransformInitSchema,
     )
 except ImportError as error:
-    raise ImportError(f"kornia_tidy.augmentation.albumentations_v2 needs albumentations 2: {error}") from error
+    raise missing("albumentations", "kornia_tidy.augmentation.albumentations_v2", error) from error
 
 
 class OpticsTransform(A.DualTransform):

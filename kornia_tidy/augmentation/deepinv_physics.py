@@ -11,11 +11,12 @@ from torch import Tensor
 
 from kornia_tidy.augmentation.linear_camera import LinearCamera
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.search_path import missing
 
 try:
     from deepinv.physics import LinearPhysics  # ty: ignore[import-not-found]
 except (ImportError, RuntimeError) as error:  # RuntimeError: it imports torchvision, which may not fit this torch
-    raise ImportError(f"kornia_tidy.augmentation.deepinv_physics needs deepinv: {error}") from error
+    raise missing("deepinv", "kornia_tidy.augmentation.deepinv_physics", error) from error
 
 
 class CameraPhysics(LinearPhysics):

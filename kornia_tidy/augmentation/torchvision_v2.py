@@ -16,13 +16,14 @@ from kornia_tidy.augmentation.depth_augmentation import checked_optics
 from kornia_tidy.camera.holes import fills_holes, with_filled
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.holes import HOLES, fill_holes
+from kornia_tidy.search_path import missing
 
 try:
     from PIL import Image as PILImage
     from torchvision import tv_tensors  # ty: ignore[import-not-found]
     from torchvision.transforms import v2  # ty: ignore[import-not-found]
 except (ImportError, RuntimeError) as error:  # RuntimeError: torchvision and torch are of different builds
-    raise ImportError(f"kornia_tidy.augmentation.torchvision_v2 needs torchvision: {error}") from error
+    raise missing("torchvision", "kornia_tidy.augmentation.torchvision_v2", error) from error
 
 
 class Depth(tv_tensors.Mask):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.quiet import caught
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra
 
 MAGIC = b"v/1\x01"
 
@@ -106,10 +106,7 @@ def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
 
 
 def _library() -> Any:
-    try:
-        return import_installed("OpenEXR")  # an extra, without type hints
-    except ImportError:
-        raise ImportError("an OpenEXR file needs OpenEXR: pip install 'kornia-tidy[exr]'") from None
+    return import_extra("OpenEXR", "an OpenEXR file")  # without type hints
 
 
 def _parts(data: bytes, *, header_only: bool) -> list[Any]:

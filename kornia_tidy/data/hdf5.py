@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra, import_installed
 
 DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -27,10 +27,7 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
         ValueError: if the file is damaged, or holds no data set or several, or a data set in it that does not hold a
             map of numbers.
     """
-    try:
-        h5py = import_installed("h5py")  # an extra, and slow to import
-    except ImportError:
-        raise ImportError("an HDF5 file needs h5py: pip install 'kornia-tidy[data]'") from None
+    h5py = import_extra("h5py", "an HDF5 file")  # slow to import
     try:
         with h5py.File(io.BytesIO(data), "r") as file:
             names = list(file)

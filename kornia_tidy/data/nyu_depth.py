@@ -15,7 +15,7 @@ from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import read_text
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra, import_installed
 
 LABELED, SPLITS = "nyu_depth_v2_labeled.mat", "splits.mat"
 SOURCES = {
@@ -116,10 +116,7 @@ def _published(root: Path, name: str) -> Path:
 
 
 def _open(path: Path) -> Any:
-    try:
-        h5py = import_installed("h5py")  # an extra, and slow to import
-    except ImportError:
-        raise ImportError("NYU Depth v2 needs h5py: pip install 'kornia-tidy[data]'") from None
+    h5py = import_extra("h5py", "NYU Depth v2")  # slow to import
     try:
         return h5py.File(path, "r")
     except FileNotFoundError:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,10 +26,7 @@ def require_matplotlib() -> None:
     Raises:
         ImportError: if matplotlib is missing.
     """
-    try:
-        import_installed("matplotlib.figure")
-    except ImportError:
-        raise ImportError("pictures need matplotlib: pip install 'kornia-tidy[plot]'") from None
+    import_extra("matplotlib.figure", "a picture")
 
 
 def encoded_figure(figure: Figure, dpi: float = 150, format: str = "png") -> bytes:  # noqa: A002 (as matplotlib has it)

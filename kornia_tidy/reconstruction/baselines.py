@@ -13,7 +13,7 @@ from kornia_tidy.checks import check_part
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.midas_small import IMAGE_DEVIATION, IMAGE_MEAN
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra
 
 NEAREST = 1e-3  # m; smaller metric estimates are taken for this depth
 
@@ -306,7 +306,8 @@ def _zoedepth(network: Any) -> MonocularDepth:
 def _load(kind: str, name_or_folder: str | os.PathLike[str], options: dict[str, Any]) -> Any:
     """Return a network of transformers with all of its weights, from safetensors."""
     options = {"use_safetensors": True, **options, "output_loading_info": True}
-    network, info = getattr(_imported(kind), kind).from_pretrained(os.fspath(name_or_folder), **options)
+    published = getattr(import_extra("transformers", kind), kind)
+    network, info = published.from_pretrained(os.fspath(name_or_folder), **options)
     if missing := sorted(info["missing_keys"]):  # transformers draws them at random and goes on
         raise ValueError(f"cannot read {name_or_folder}: {len(missing)} weights are missing, first {missing[0]}")
     return network
@@ -320,11 +321,4 @@ def _transformers(name: str, in_channels: int, out_channels: int, width: int) ->
         )
     if not isinstance(width, int) or width < 8 or width % 8 or (width > 64 and width % 64):
         raise ValueError(f"width must be a multiple of 8, above 64 of 64, got {width!r}")
-    return _imported(name)
-
-
-def _imported(name: str) -> Any:
-    try:
-        return import_installed("transformers")
-    except ImportError:
-        raise ImportError(f"{name} needs transformers: pip install 'kornia-tidy[baselines]'") from None
+    return import_extra("transformers", name)

@@ -20,7 +20,7 @@ from kornia_tidy.reconstruction.half_precision import halved
 from kornia_tidy.reconstruction.model_card import check_license, model_card
 from kornia_tidy.reconstruction.settings import RENAMED
 from kornia_tidy.reconstruction.trained import TrainedSystem, below, psfs_to_store, system_of_state
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra
 from kornia_tidy.tensor_files import read_tensors
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"  # the names of huggingface_hub's mixins
@@ -201,12 +201,7 @@ def _standard(value: Any) -> Any:
 
 def _download(repository: str, file: str, options: Mapping[str, Any]) -> Path:
     """Return the path of a file of a repository, downloaded unless it is in the cache."""
-    try:
-        hub = import_installed("huggingface_hub")  # for repositories only
-    except ImportError:
-        raise ImportError(
-            f"there is no folder {repository}; to download the repository of this name: pip install 'kornia-tidy[hub]'"
-        ) from None
+    hub = import_extra("huggingface_hub", f"there is no folder {repository}, and the repository of this name")
     try:
         return Path(hub.hf_hub_download(repository, file, library_name=LIBRARY, **options))
     except (OSError, ValueError) as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kornia_tidy.search_path import import_installed
+from kornia_tidy.search_path import import_extra
 
 
 def require_lightning() -> None:
@@ -11,8 +11,5 @@ def require_lightning() -> None:
     Raises:
         ImportError: if one is missing.
     """
-    try:
-        import_installed("lightning.pytorch")
-        import_installed("tensorboard")
-    except ImportError:
-        raise ImportError("training needs lightning and tensorboard: pip install 'kornia-tidy[train]'") from None
+    for name in ("lightning.pytorch", "tensorboard"):
+        import_extra(name, "training")

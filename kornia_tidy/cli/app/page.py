@@ -13,13 +13,14 @@ from kornia_tidy.cli.app.controls import CONTROLS, Control, Group, shown
 from kornia_tidy.cli.app.guard import LARGEST_UPLOAD, Guard
 from kornia_tidy.cli.app.settings import SIDES, Settings
 from kornia_tidy.files import write_bytes
+from kornia_tidy.search_path import missing
 
 try:
     import fastapi  # ty: ignore[import-not-found]
     import gradio as gr  # ty: ignore[import-not-found]
     import uvicorn  # ty: ignore[import-not-found]
 except ImportError as error:
-    raise ImportError(f"the app needs Gradio: pip install 'kornia-tidy[app]' ({error})") from error
+    raise missing("gradio", "the app", error) from error
 
 TITLE = "kornia_tidy: a camera with programmable phase masks"
 INTRODUCTION = """\

@@ -22,7 +22,7 @@ class TestCommand(BaseTester):
     def test_exception_without_gradio_the_remedy_is_told(self, capsys):
         pytest.importorskip("matplotlib")
         assert main(["app"]) == 2
-        assert "the app needs Gradio: pip install 'kornia-tidy[app]'" in capsys.readouterr().err
+        assert "the app needs gradio: pip install 'kornia-tidy[app]'" in capsys.readouterr().err
 
 
 class TestConstraints(BaseTester):
