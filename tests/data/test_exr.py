@@ -56,7 +56,7 @@ LAYERS = {
 }  # fmt: skip
 UNCLEAR = {
     "two layers": ({"left.Z": DEPTH, "right.Z": DEPTH}, "it may be any of left.Z, right.Z"),
-    "a picture": ({"R": DEPTH, "G": OTHER, "B": DEPTH}, "its red, green and blue differ: of B, G, R write it alone"),
+    "a picture": ({"R": DEPTH, "G": OTHER, "B": DEPTH}, "its red, green and blue differ: of B, G, R write only one"),
     "vectors": (colours("Normal.", names="XYZ"), "none is named for it: of Normal.X, Normal.Y, Normal.Z"),
     "mist": ({**colours(), "Mist.Z": OTHER}, "none is named for it"),
 }

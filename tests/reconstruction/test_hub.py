@@ -150,7 +150,7 @@ class TestFromPretrained(BaseTester):
         with pytest.raises(FileNotFoundError, match=r"model\.safetensors: there is no such file"):
             from_pretrained(folder)
         monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-        with pytest.raises(ImportError, match=r"no folder ada/system; .* pip install 'kornia-tidy\[hub\]'"):
+        with pytest.raises(ImportError, match=r"no folder ada/system, .* pip install 'kornia-tidy\[hub\]'"):
             from_pretrained("ada/system")
 
     def test_feature_a_repository_is_downloaded_file_by_file(self, folder, monkeypatch):
