@@ -153,24 +153,28 @@ def plot(known: dict[str, Any], path: Path) -> None:
     panels = [
         pair for pair in dict.fromkeys(cell[:2] for cell in cells()) if any(_of(known, *pair, k) for k in (5, 2, 1))
     ]
-    figure = Figure(figsize=(3.4 * len(panels), 3.6), facecolor="white", layout="constrained")
-    for axes, (matters, depths) in zip(
-        figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True
-    ):
-        for masks, color in ((5, ACCENT), (2, INK), (1, FAINT)):
+    rows = math.ceil(len(panels) / 2)
+    figure = Figure(figsize=(5.2, 0.8 + 2.3 * rows), facecolor="white", layout="constrained")  # legible on a phone
+    charts = figure.subplots(rows, 2, sharey=True, sharex=True, squeeze=False).flatten()
+    for axes, (matters, depths) in zip(charts, panels, strict=False):
+        for masks, color, shift in ((5, ACCENT, 1.0), (2, INK, 1.12), (1, FAINT, 0.89)):  # bars beside each other
             points = _of(known, matters, depths, masks)
             if points:
                 lights, gains, errors = zip(*points, strict=True)
-                axes.errorbar(lights, gains, [2 * error for error in errors], color=color, marker="o", markersize=4,
-                              capsize=2, linewidth=1.3, label=f"K = {masks}")  # fmt: skip
+                axes.errorbar([light * shift for light in lights], gains, [2 * error for error in errors], color=color,
+                              marker="o", markersize=5, capsize=3, linewidth=1.6, label=f"{masks} mask{'s' * (masks > 1)}")  # fmt: skip
         axes.axhline(0, color=INK, linewidth=0.8)
         axes.set_xscale("log")
-        axes.set_title(f"{matters}, {depths}", fontsize=9, color=INK)
-        axes.set_xlabel("electrons of white at f/17.6", fontsize=8, color=INK)
-        open_chart(axes, 7.5)
-    figure.axes[0].set_ylabel("masks over the best flat lens, dB", fontsize=8, color=INK)
-    figure.axes[0].legend(fontsize=7.5, frameon=False)
-    figure.savefig(path, dpi=130)
+        axes.set_title(f"{matters}, {depths}", fontsize=11, color=INK)
+        axes.tick_params(labelbottom=True)
+        open_chart(axes, 10)
+    figure.supxlabel("electrons of white at f/17.6", fontsize=11, color=INK)
+    figure.supylabel("masks over the best flat lens, dB", fontsize=11, color=INK)
+    if len(panels) % 2:
+        charts[-1].remove()
+    figure.legend(*charts[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(0.9, 0.12), fontsize=11,
+                  frameon=False)  # fmt: skip
+    figure.savefig(path, dpi=150)
 
 
 def _of(known: dict[str, Any], matters: str, depths: str, masks: int) -> list[tuple[float, float, float]]:
