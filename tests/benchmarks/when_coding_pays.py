@@ -161,8 +161,9 @@ def plot(known: dict[str, Any], path: Path) -> None:
             points = _of(known, matters, depths, masks)
             if points:
                 lights, gains, errors = zip(*points, strict=True)
-                axes.errorbar([light * shift for light in lights], gains, [2 * error for error in errors], color=color,
-                              marker="o", markersize=5, capsize=3, linewidth=1.6, label=f"{masks} mask{'s' * (masks > 1)}")  # fmt: skip
+                places, bars = [light * shift for light in lights], [2 * error for error in errors]
+                look = {"color": color, "marker": "o", "markersize": 5, "capsize": 3, "linewidth": 1.6}
+                axes.errorbar(places, gains, bars, label=f"{masks} mask{'s' * (masks > 1)}", **look)
         axes.axhline(0, color=INK, linewidth=0.8)
         axes.set_xscale("log")
         axes.set_title(f"{matters}, {depths}", fontsize=11, color=INK)
