@@ -67,7 +67,7 @@ def simulate(
         color: order of the three channels of image and capture; ``cv2.imread`` gives ``"bgr"``.
         seed: of the sensor's noise. Default: drawn from torch's global generator.
         holes: ``"fill"`` fills holes of the depth from the nearest known pixel, as :func:`kornia_tidy.data.fill_holes`
-            does; ``"error"`` leaves them to the camera. Where they were, ``fill_holes(depth)`` says.
+            does; ``"error"`` leaves them to the camera. ``fill_holes(depth)`` also returns where they were.
         lens: a real lens in front of the default masks, or its name; ``optics`` has its own.
         field_center: where the middle of the picture lies from the lens's axis, y and x in sensor pixels: (2,), or
             (B, 2).
@@ -116,9 +116,9 @@ def reconstruct(
 
     Args:
         capture: (H, W), (H, W, 3) or, as a batch, (B, H, W, 1) or (B, H, W, 3); uint8, uint16, or float32 in [0, 1].
-        system: the camera or the trained system of the captures. The network for any camera restores those of a
-            :class:`~kornia_tidy.TiDyOptics`, of the file of one, or of a :class:`~kornia_tidy.PSFBank`, whose noise is
-            measured in the first capture. A system is a name of
+        system: the camera or the trained system of the captures. The network any-camera restores captures of a
+            :class:`~kornia_tidy.TiDyOptics`, of a saved camera's file, and of a :class:`~kornia_tidy.PSFBank`:
+            its noise is measured in the first capture. A trained system is a name of
             :data:`~kornia_tidy.reconstruction.pretrained.PRETRAINED`, or an argument or result of
             :func:`~kornia_tidy.reconstruction.hub.from_pretrained`. For many calls with a system of your
             own, a :class:`~kornia_tidy.reconstruction.light_head.LightHead` of it saves the preparation.

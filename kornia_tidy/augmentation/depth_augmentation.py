@@ -1,4 +1,4 @@
-"""Augmentations that read a depth map: how depth reaches them, alone and in kornia's containers."""
+"""Augmentations that read a depth map: how depth reaches them, by a call and in kornia's containers."""
 
 from __future__ import annotations
 
@@ -133,8 +133,8 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
         - ``augmentation(image)`` inside a container: behind ``augmentation.depth_tap``, or with :func:`bound_depth`.
 
     Convention:
-        - A container of kornia returns the depth with its holes, warped with it. Call
-          ``depth, valid = kornia_tidy.data.fill_holes(depth)`` on what it returns.
+        - A container of kornia returns the depth with its holes, warped with it. Fill
+          them behind it: ``depth, valid = kornia_tidy.data.fill_holes(depth)``.
     """
 
     def __init__(
@@ -233,7 +233,7 @@ class DepthAugmentation(K.IntensityAugmentationBase2D):
 
 
 def checked_optics(optics: nn.Module | None) -> nn.Module:
-    """Return what takes the pictures of an adapter: the camera or augmentation that was given, or a default camera.
+    """Return the camera or the augmentation that takes an adapter's captures; a default camera for None.
 
     Raises:
         TypeError: if it is neither.
@@ -302,7 +302,7 @@ def bound_depth(container: nn.Module, depth: Tensor) -> Generator[None]:
 
 
 def moves_pixels(module: nn.Module) -> bool:
-    """Return whether a module may move pixels; every module counts that is not known to leave them in place.
+    """Return whether a module may move pixels: True unless it is known to leave them in place.
 
     Example:
         >>> moves_pixels(K.RandomHorizontalFlip()), moves_pixels(K.ColorJiggle(0.1)), moves_pixels(nn.Identity())

@@ -388,7 +388,7 @@ _CELLS = 23  # of a pupil without masks that a lens's own stop cuts
 def _lens_camera(
     lens: Lens | str, pixel_pitch: float, compositing: str, color_space: str, given: Sequence[Any]
 ) -> TiDyOptics:
-    """Return a camera without masks and noise behind a real lens; refuse what discs alone have."""
+    """Return a camera without masks and noise behind a real lens; refuse options that only discs have."""
     for (name, usual), value in zip(_DISCS.items(), given, strict=True):
         if value != usual:
             raise ValueError(f"a real lens has its own focus, f-number and blur: leave {name} out, got {value}")

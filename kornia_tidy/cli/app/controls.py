@@ -129,7 +129,7 @@ CONTROLS = (
         "Camera",
         "choice",
         "camera",
-        "Trained systems come with a network; one for any camera restores the others, without depth.",
+        "Trained systems come with a network. The network any-camera restores the others, without depth.",
         [(camera_name(name), name) for name in (*PRETRAINED, *SYSTEMS, OWN)],
     ),
     Control(

@@ -30,8 +30,8 @@ class Demo:
     masks that is stopped down: the same exposure time and the same light. Both captures are
     restored in closed form and, where a trained network is shipped for the camera, by the
     network. A third camera estimates the depth of every pixel. All scores are on the page.
-    Masks, family or f-number make up another camera, whose captures the network for any
-    camera restores, without training.
+    Masks, family or f-number make up another camera. The network any-camera restores its
+    captures without training.
     The depths of your own scene are stretched, in dioptres, over the range for which the
     masks were made.
 
