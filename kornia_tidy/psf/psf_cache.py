@@ -114,7 +114,7 @@ def values_of(*parts: object) -> tuple[Hashable, ...]:
     found: list[Hashable] = []
     for part in parts:
         if isinstance(part, Tensor):
-            bits = part.detach().cpu().contiguous().view(-1).view(torch.uint8)  # NumPy does not have all data types
+            bits = part.detach().cpu().flatten().view(torch.uint8)  # NumPy does not have all data types
             found += part.dtype, part.device, tuple(part.shape), bits.numpy().tobytes()
         elif isinstance(part, nn.Module):
             found.append(weakref.ref(part))

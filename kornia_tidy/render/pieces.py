@@ -10,7 +10,7 @@ on coarse grids). A piece computes its PSFs when it is asked for them, so that a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from math import inf
@@ -182,7 +182,7 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     if piece.field is not None and isinstance(bank, FieldBank):
         seen = render_over_field(light, defocus, bank, piece.field, rendering)
     else:
-        seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, **asdict(rendering))
+        seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, **vars(rendering))
     if inside is not None and gathers:
         seen = torch.where(cropped(inside, margin), seen, 0)
     if isinstance(piece.share, Tensor) and piece.share.ndim:

@@ -245,12 +245,13 @@ def assign_layers(defocus: Tensor, nodes: Tensor, mode: str) -> tuple[Tensor, Te
     check_float_tensor("nodes", nodes, 1, "(D,)")
     dtype = torch.promote_types(torch.promote_types(defocus.dtype, nodes.dtype), torch.float32)
     defocus, nodes = defocus.to(dtype), nodes.to(dtype)
-    spacing: Tensor | None = None  # of nodes that are evenly spaced
+    spacing: float | None = None  # of nodes that are evenly spaced, among which nothing is searched
     if nodes.device.type == "cpu" and len(nodes) > 1 and not (nodes.requires_grad or Mode.TRANSFORM in torch_mode()):
-        # Between evenly spaced nodes there is nothing to search, which takes ten times as long.
-        step, rounding = (nodes[-1] - nodes[0]) / (len(nodes) - 1), 4 * torch.finfo(dtype).eps * nodes.abs().max()
-        apart = (nodes - (nodes[0] + step * torch.arange(len(nodes), dtype=dtype))).abs()
-        spacing = step if bool(((apart <= rounding) & (step > 2 * rounding)).all()) else None
+        places = nodes.tolist()
+        step = (places[-1] - places[0]) / (len(places) - 1)
+        rounding = 4 * torch.finfo(dtype).eps * max(map(abs, places))
+        even = step > 2 * rounding and all(abs(x - places[0] - i * step) <= rounding for i, x in enumerate(places))
+        spacing = step if even else None
     if nodes.device.type == "cpu" and spacing is None:
         check_nodes(nodes)
     if mode == "nearest" and spacing is not None:
