@@ -27,7 +27,6 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from kornia_tidy import (
-    DefocusRange,
     DwellTimes,
     Fidelity,
     LearnableDwellTimes,
@@ -189,7 +188,7 @@ EQUAL = dict(equal_cases())
 
 
 def serve() -> None:
-    """Do what lines of standard input ask for, and answer with milliseconds: a case's name, and a file for the result."""
+    """Run the case that each line of standard input names, with a file for its result, and answer with milliseconds."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     known: dict[str, Work] = {}
