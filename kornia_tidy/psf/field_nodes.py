@@ -31,8 +31,9 @@ CELLS = (16, 128)  # px along the side of the smallest and largest cell that see
 _KNOWN = 15  # Chebyshev points along a line at which phases are computed
 _RINGS = ((0.0, 1), (0.5, 4), (0.9, 8))  # radius in the stop, and points there
 # Error of PSFs over that of the factors of these pairs, as much light passes pairs that lie close together: measured at
-# most .25 for five random masks and .39 for three, .3 to .7 for a bare lens.
-_OF_PAIRS = 0.4
+# most .25 for five random masks and .39 for three, .3 to .7 for a bare lens, .47 and more for one mask.
+_OF_PAIRS, _OF_PAIRS_OF_FEW = 0.4, 0.7
+_FEW = 2
 
 
 @on_cpu
@@ -45,6 +46,7 @@ def field_nodes(
     pixel_pitch: float,
     reach: float,
     tolerance: float,
+    masks: int,
 ) -> Field:
     """Return the fewest nodes over a picture, and the largest cells, with a relative error of PSFs (L2) of a tolerance.
 
@@ -57,12 +59,12 @@ def field_nodes(
         pixel_pitch: of the sensor in metres.
         reach: pixels from the PSF's middle within which most of its light falls.
         tolerance: relative error of the PSFs. A warning tells where :data:`MOST_NODES` leave more.
+        masks: that are shown; 1 for a lens without masks. PSFs of one or two follow nodes less well.
 
-    PSFs of several random masks keep the tolerance at the nodes' worst place; those of a bare lens were off by up to
-    1.7 times as much. PSFs are taken as constant in cells in which their first order stays within the tolerance.
+    PSFs are taken as constant in cells in which their first order stays within the tolerance.
 
     Example:
-        >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2)
+        >>> lens, given = Lens.named("single-50mm", 17.6, 0.595), ((-20.0, 20.0), 470e-9, 8e-6, 10.0, 3e-2, 5)
         >>> whole = field_nodes((1110, 1282), (0.0, 0.0), lens, *given)
         >>> whole.nodes, whole.cell
         ((6, 7), 128)
@@ -72,7 +74,8 @@ def field_nodes(
     errors, slopes, bends = zip(
         *_along_axes(size, center, lens.table, tuple(defocus), wavelength, pixel_pitch, reach), strict=True
     )
-    errors = _OF_PAIRS * torch.hypot(errors[0][:, None], errors[1])
+    of_pairs = _OF_PAIRS_OF_FEW if masks <= _FEW else _OF_PAIRS
+    errors = of_pairs * torch.hypot(errors[0][:, None], errors[1])
     if (beyond := float(errors[-1, -1])) > tolerance:
         warnings.warn(
             f"PSFs of the lens {lens.name!r} vary so much over {size[0]}x{size[1]} px that {MOST_NODES} places along a "

@@ -365,7 +365,9 @@ class PSFModel:
             )
         known, lens, camera, center = self._derived.fields, self.lens, self.camera, check_center(center)
         table, tolerance = None if lens is None else lens.table, self.fidelity.field_tolerance
-        asked = size, center, table, camera.pixel_pitch, camera.defocus_range, self.measured
+        phase, one = self.masks.phase, self.state is not None or self.moment is not None
+        masks = 1 if self.measured is not None or one or is_flat(phase) else len(phase)
+        asked = size, center, table, camera.pixel_pitch, camera.defocus_range, self.measured, masks
         if (field := known.get(asked)) is None:
             if lens is None or self.measured is not None:
                 bank = cast("FieldBank", self.measured)
@@ -375,7 +377,7 @@ class PSFModel:
                 corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
                 self._warn_if_beyond(corners, camera.defocus_range)
                 given = camera.defocus_range, min(self._sampled.wavelengths), camera.pixel_pitch, self.window / 4
-                field = field_nodes(size, center, lens, *given, tolerance)
+                field = field_nodes(size, center, lens, *given, tolerance, masks)
             known[asked] = field
             if len(known) > MOST_FIELDS:
                 known.pop(next(iter(list(known))), None)
