@@ -24,7 +24,6 @@ from torch import Tensor
 
 from kornia_tidy import TiDyOptics
 from kornia_tidy.data import sample_scene
-from kornia_tidy.figures.explained import single_mask_banks
 from kornia_tidy.modulator import DwellTimes
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 
@@ -48,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
     system = load_pretrained("edof-designed")
     scene, optics = sample_scene(height=options.size), system.optics
     count = len(optics.masks.heights())
-    banks = single_mask_banks(optics, count)
+    banks = [optics.through_state(k).psf_bank() for k in range(count)]
     nodes = torch.linspace(len(banks[0].defocus) - 1, 0, DEPTHS).round().long().tolist()  # nearest first
     metres = optics.camera.depth(banks[0].defocus[nodes]).tolist()
     phases = optics.masks.phase.remainder(2 * math.pi) / (2 * math.pi)

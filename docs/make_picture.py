@@ -24,7 +24,6 @@ from PIL import Image
 from torch import Tensor
 
 from kornia_tidy.data import sample_scene
-from kornia_tidy.figures.explained import single_mask_banks
 from kornia_tidy.psf import PSFBank
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tasks import split_maps
@@ -85,7 +84,7 @@ def _psfs(figure: Figure, system: TrainedSystem) -> None:
     for column, metres in enumerate(optics.camera.depth(average.defocus[columns]).tolist()):
         label = f"{metres:.2f} m" if metres < 1e3 else "\N{INFINITY}"
         _text(figure, PSFS_X + column * STEP + CELL / 2, TOP + 0.12, label, 9.5, FAINT, ha="center")
-    for row, bank in enumerate(single_mask_banks(optics, count)):
+    for row, bank in enumerate(optics.through_state(k).psf_bank() for k in range(count)):
         y = TOP - CELL - row * STEP
         _mask(figure, MASKS_X, y, optics.masks.phase[row], optics.pupil.amplitude)
         _row_of_psfs(figure, y, bank, columns)

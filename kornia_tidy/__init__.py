@@ -54,23 +54,7 @@ __all__ = [
     "simulate",
 ]
 
-_MODULES = {
-    "augmentation.arrays": ("reconstruct", "simulate"),
-    "camera.burst": ("burst",),
-    "camera.motion": ("moving_capture",),
-    "camera.tidy_optics": ("TiDyOptics",),
-    "fidelity": ("Fidelity",),
-    "masks.fresnel": ("FresnelLens",),
-    "masks.no_mask": ("NoMask",),
-    "masks.pixelwise": ("PixelwiseMask",),
-    "modulator.modulator": ("DwellTimes", "LearnableDwellTimes", "SpatialLightModulator"),
-    "modulator.switching": ("Switching",),
-    "optics.spectrum": ("Spectrum",),
-    "optics.thin_lens": ("DefocusRange", "ThinLensCamera"),
-    "psf.psf_bank": ("PSFBank",),
-    "sensor.sensor": ("SensorNoise",),
-}
-__getattr__ = importer(__name__, _MODULES)
+__getattr__ = importer(__name__)
 sys.meta_path.insert(0, MovedModules())
 
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
+_IMPORT = re.compile(r"^    from (kornia_tidy\.[\w.]+) import (\([^)]*\)|.+)$", re.MULTILINE)
 
-def importer(package: str, modules: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
+
+def importer(package: str) -> Callable[[str], Any]:
     """Return the function ``__getattr__`` of a package, which imports a public name or a module when it is asked for.
 
     Args:
-        package: its name.
-        modules: public names by the module of the package that defines them.
+        package: its name. The imports below ``if TYPE_CHECKING:`` in its file say which module defines a public name.
 
     Returns:
         A function from a name to its value.
@@ -27,10 +29,14 @@ def importer(package: str, modules: Mapping[str, Sequence[str]]) -> Callable[[st
         A public name that its module shares means the name, not the module, whatever was imported before.
 
     Example:
-        >>> importer("kornia_tidy", {"optics.spectrum": ["REFERENCE_WAVELENGTH"]})("REFERENCE_WAVELENGTH")
-        5.3e-07
+        >>> importer("kornia_tidy.design")("MOST_MASKS")
+        Traceback (most recent call last):
+        ...
+        AttributeError: module 'kornia_tidy.design' has no attribute 'MOST_MASKS'
     """
-    homes = {name: module for module, names in modules.items() for name in names}
+    module: Any = sys.modules[package]
+    source = module.__spec__.loader.get_source(package)
+    homes = {name: home for home, names in _IMPORT.findall(source) for name in re.findall(r"\w+", names)}
 
     class Package(ModuleType):
         """A package that no import of a module gives the module under a public name."""
@@ -39,16 +45,16 @@ def importer(package: str, modules: Mapping[str, Sequence[str]]) -> Callable[[st
             if not (name in homes and isinstance(value, ModuleType)):
                 super().__setattr__(name, value)
 
-    sys.modules[package].__class__ = Package
+    module.__class__ = Package
 
     def asked_for(name: str) -> Any:
         if name in homes:
-            value = getattr(import_module(f"{package}.{homes[name]}"), name)
+            value = getattr(import_module(homes[name]), name)
         elif not name.startswith("_") and find_spec(f"{package}.{name}"):
             value = import_module(f"{package}.{name}")
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        setattr(sys.modules[package], name, value)
+        setattr(module, name, value)
         return value
 
     return asked_for

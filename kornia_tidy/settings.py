@@ -181,11 +181,29 @@ def _setting(one: Any, group: type, hint: Any, purpose: str = "", unset: str = "
 @cache
 def documented(cls: type) -> tuple[str, str, dict[str, str]]:
     """Return the first sentence of a docstring, the text below it, and the entries of its ``Args``."""
-    head, _, rest = inspect.cleandoc(cls.__doc__ or "").partition("\n\nArgs:\n")
+    head, *sections = re.split(r"\n\n(?=(?:Args|Notes|Examples):\n)", inspect.cleandoc(cls.__doc__ or ""))
+    rest = next((text.removeprefix("Args:\n") for text in sections if text.startswith("Args:\n")), "")
     summary, _, text = head.partition("\n\n")
     block = re.split(r"\n(?=\w[\w ]*:\n)", rest)[0]
     entries = re.findall(r"^    (\w+): (.*(?:\n     +.*)*)", block, re.MULTILINE)
     return plain(summary), text, {name: plain(entry) for name, entry in entries}
+
+
+def section(cls: type, title: str) -> str:
+    """Return a section of a docstring without its indentation; an empty text if there is none.
+
+    Example:
+        >>> class Lens:
+        ...     '''Lens.
+        ...
+        ...     Notes:
+        ...         Plain glass.
+        ...     '''
+        >>> section(Lens, "Notes")
+        'Plain glass.'
+    """
+    found = re.search(rf"^{title}:\n((?:    .*\n?|\n)+)", inspect.cleandoc(cls.__doc__ or ""), re.MULTILINE)
+    return re.sub("^    ", "", found[1].rstrip(), flags=re.MULTILINE) if found else ""
 
 
 def plain(text: str) -> str:

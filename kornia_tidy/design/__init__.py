@@ -40,28 +40,4 @@ __all__ = [
     "restoration_error",
 ]
 
-__getattr__ = importer(
-    __name__,
-    {
-        "candidates": ("Candidate",),
-        "co_design": (
-            "CoDesign",
-            "Effort",
-            "co_design",
-            "planned_work",
-        ),
-        "depth_confusion": ("depth_confusion",),
-        "design_report": ("design_files",),
-        "design_task": ("DesignTask",),
-        "fisher_information": ("crlb",),
-        "non_convexity": ("autocorrelation_bound",),
-        "objectives": (
-            "design",
-            "restoration_error",
-        ),
-        "verdict": (
-            "Finalist",
-            "Verdict",
-        ),
-    },
-)
+__getattr__ = importer(__name__)

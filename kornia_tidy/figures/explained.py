@@ -12,9 +12,7 @@ from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at, depth_bar, depth_colors, metres
 from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, quiet, require_matplotlib
 from kornia_tidy.masks.base import central_square
-from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.psf.psf_bank import PSFBank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,74 +64,51 @@ def explain(
     lo, hi = camera.defocus_range
     _picture(left[1], depth_colors((camera.defocus(depth) - lo) / (hi - lo)), "its depth; bright is near")
     depth_bar(left[2], camera)
-    _table(parts[1], optics, camera)
+    words = "2  Masks     3  Point spread functions (PSFs) over depth, near to far"
+    parts[1].suptitle(words, size=TITLE, color=ACCENT)
+    draw_masks_and_psfs(parts[1], optics, camera)
     parts[2].suptitle("4  Coded captures", size=TITLE, color=ACCENT)
     _picture(right[0], coded_first, "K = 1: the first mask all the time")
     _picture(right[1], coded_all, f"K = {masks}: all {masks} masks, 1/{masks} of the time each")
     return figure
 
 
-def single_mask_banks(optics: TiDyOptics, masks: int) -> list[PSFBank]:
-    """Return the PSF bank of each of the first masks without the others, in the window of the time-averaged PSFs.
+def draw_masks_and_psfs(part: Figure | SubFigure, optics: TiDyOptics, camera: ThinLensCamera) -> None:
+    """Draw a row for each mask with its PSFs over depth, near to far, and a last one with their average.
 
-    Example:
-        >>> from kornia_tidy import Fidelity, PixelwiseMask
-        >>> optics = TiDyOptics(PixelwiseMask(2), fidelity=Fidelity(window=23, layer_spacing=20.0))
-        >>> banks = single_mask_banks(optics, 2)
-        >>> light = [bank.psfs * bank.energy[..., None, None] for bank in (*banks, optics.psf_bank())]
-        >>> torch.allclose((light[0] + light[1]) / 2, light[2], atol=1e-6)
-        True
+    Convention:
+        Each PSF is drawn as the root of its light, on its own scale. Five masks at most are shown, and of measured PSFs
+        the average only.
     """
-    count = optics.masks.phase.shape[0]
-    alone = TiDyOptics(
-        optics.masks,
-        camera=optics.camera,
-        fidelity=optics.fidelity.replace(window=optics.window),
-        color_space=optics.color_space,
-        spectrum=optics.spectrum,
-        aperture=optics.aperture,
-    )
-    banks = []
-    with torch.no_grad():
-        for k in range(masks):
-            alone.modulator = DwellTimes([float(k == other) for other in range(count)])
-            banks.append(alone.psf_bank())
-    return banks
-
-
-def _table(part: SubFigure, optics: TiDyOptics, camera: ThinLensCamera) -> None:
-    """Draw a row for each mask with its PSFs, and a last one with their average."""
     phase = central_square(optics.masks.phase).detach().cpu().remainder(2 * math.pi)
-    shown = min(len(phase), MOST_ROWS)
+    shown = min(len(phase), MOST_ROWS) if optics.psf_model.measured is None else 0
+    lo, hi = camera.defocus_range
+    defocus = torch.linspace(hi, lo, COLUMNS, dtype=torch.float64).tolist()
     with torch.no_grad():
-        average = optics.psf_bank()
-    nodes = torch.linspace(len(average.defocus) - 1, 0, COLUMNS).round().long().tolist()  # nearest first
-    part.suptitle("2  Masks     3  Point spread functions (PSFs) over depth, near to far", size=TITLE, color=ACCENT)
+        cameras = [*(optics.through_state(k) for k in range(shown if len(phase) > 1 else 0)), optics]
+        psfs = [one.psf_bank(defocus=defocus[::-1]).psfs.flip(0).cpu() for one in cameras]
     more = f", {shown} shown" if shown < len(phase) else ""
-    words = (
-        f"the shutter stays open, so the sensor adds up all {len(phase)} masks{more}; phase: dark 0, light π, dark 2π"
-    )
-    part.supxlabel(words, size=SMALL, color=FAINT)
-    axes = part.subplots(shown + 1, 1 + COLUMNS, squeeze=False)
-    for column, node in enumerate(nodes, 1):
-        psi = round(float(average.defocus[node]))
-        depth = metres(depth_at(float(average.defocus[node]), camera))
-        axes[0, column].set_title(f"{depth} m\nψ = {psi:+d}" if psi else f"{depth} m\nψ = 0", size=LABEL, color=INK)
+    adds = f"the shutter stays open, so the sensor adds up all {len(phase)} masks{more}; " if len(phase) > 1 else ""
+    part.supxlabel(f"{adds}phase: dark 0, light π, dark 2π", size=SMALL, color=FAINT)
+    axes = part.subplots()  # one for all pictures: forty axes take longer to draw
+    axes.set(xlim=(0, COLUMNS + 1.2), ylim=(len(psfs), -0.5))
+    axes.set_axis_off()
+    middle: dict[str, Any] = {"ha": "center", "va": "center"}
+    for column, psi in enumerate(defocus):
+        sign = f"{round(psi):+d}" if round(psi) else "0"
+        words = f"{metres(depth_at(psi, camera))} m\nψ = {sign}"
+        axes.text(column + 1.65, -0.25, words, size=LABEL, color=INK, **middle)
     amplitude = optics.pupil.transmission
     light = torch.nn.functional.avg_pool2d(amplitude[None, None].double(), amplitude.shape[-1] // phase.shape[-1])[0, 0]
-    for row, bank in enumerate([*single_mask_banks(optics, shown), average]):
-        mask = axes[row, 0]
+    for row, own in enumerate(psfs):
         if row < shown:
-            seen = phase[row].where(light > 0, math.nan).numpy()
-            mask.imshow(seen, cmap=PHASE_COLORS, vmin=0, vmax=2 * math.pi, interpolation="nearest")
-            mask.set_title(str(row + 1), size=SMALL, color=INK)
+            colors: dict[str, Any] = {"cmap": PHASE_COLORS, "vmin": 0, "vmax": 2 * math.pi, "interpolation": "nearest"}
+            axes.imshow(phase[row].where(light > 0, math.nan).numpy(), extent=(0, 0.9, row + 0.9, row), **colors)
         else:
-            words = f"average\nof {len(phase)}"
-            mask.text(0.5, 0.5, words, size=LABEL, weight="bold", ha="center", va="center", transform=mask.transAxes)
-        mask.set_axis_off()
-        for column, node in enumerate(nodes, 1):
-            psf = bank.psfs[node].detach().cpu()
-            _picture(axes[row, column], (psf / psf.max().clamp(min=1e-30)).sqrt())
+            axes.text(0.45, row + 0.45, f"average\nof {len(phase)}", size=LABEL, weight="bold", **middle)
+        for column, psf in enumerate(own):
+            pixels = (psf / psf.max().clamp(min=1e-30)).clamp(min=0).sqrt().expand(3, -1, -1).permute(1, 2, 0).numpy()
+            axes.imshow(pixels, extent=(column + 1.2, column + 2.1, row + 0.9, row), interpolation="antialiased")
 
 
 def _picture(axes: Axes, image: Tensor, title: str = "") -> None:

@@ -64,46 +64,4 @@ __all__ = [
     "self_ensemble",
 ]
 
-__getattr__ = importer(
-    __name__,
-    {
-        "any_camera": ("AnyCameraHead",),
-        "attention_unet": ("AttentionUNet",),
-        "closed_form": (
-            "ClosedForm",
-            "Restoration",
-            "closed_form_channels",
-        ),
-        "closed_form_head": ("ClosedFormHead",),
-        "head": ("ReconstructionHead",),
-        "joint": (
-            "JointEstimate",
-            "JointHead",
-            "UncertainJointEstimate",
-        ),
-        "joint_closed_form": ("JointClosedFormHead",),
-        "layered_joint": ("LayeredJointHead",),
-        "midas_small": (
-            "MiDaSSmall",
-            "load_midas_small",
-        ),
-        "nafnet": ("NAFNet",),
-        "phasecam3d_unet": ("PhaseCam3DUNet",),
-        "receptive_field": ("receptive_field",),
-        "refocused": ("Refocused",),
-        "residual": ("Residual",),
-        "restored_over_field": ("restored_over_field",),
-        "ruled_closed_form": ("RuledClosedForm",),
-        "self_ensemble": (
-            "SelfEnsemble",
-            "self_ensemble",
-        ),
-        "tikhonov": (
-            "Preconditioned",
-            "Tikhonov",
-            "TikhonovLayers",
-        ),
-        "tiled": ("reconstruct_tiled",),
-        "wiener": ("Wiener",),
-    },
-)
+__getattr__ = importer(__name__)

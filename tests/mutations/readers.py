@@ -26,7 +26,7 @@ from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
 from kornia_tidy.lab.mask_export import read_heights, read_response, read_slm_frames
 from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
-from kornia_tidy.lab.raw.tags import camera_tags, kodak_matrix, tiff_directories
+from kornia_tidy.lab.raw.tags import camera_tags, tiff_directories
 from kornia_tidy.optics import Lens
 from kornia_tidy.reconstruction import load_midas_small
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
@@ -301,7 +301,6 @@ def _raw_files(folder: Path) -> list[Case]:
     def read_tags(path: Path) -> None:
         data = path.read_bytes()
         camera_tags(data)
-        kodak_matrix(data)
         directories = list(tiff_directories(data))
         missing_bytes(data, directories)
         sensor = dng_sensor(data, directories)

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from kornia_tidy.cli.app.capture import Result, Tell, take_picture
-from kornia_tidy.cli.app.controls import settings_of
 from kornia_tidy.cli.app.legends import legends, mistake, status
 from kornia_tidy.cli.app.pictures import Picture, depth_map, masks_and_psfs, photograph
 from kornia_tidy.cli.app.script import as_python
+from kornia_tidy.cli.app.settings import settings_of
 
 PICTURES = ("scene", "capture", "image", "depth", "estimate", "psfs")
 KEPT = "The pictures are those of the settings before."

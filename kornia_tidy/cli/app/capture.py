@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.cli.app.scenes import chart, read_files
+from kornia_tidy.cli.app.scenes import read_files
 from kornia_tidy.cli.app.settings import AS_SYSTEM, FILES, FLAT, IDEAL, OWN, Settings
 from kornia_tidy.data.dead_leaves import dead_leaves
 from kornia_tidy.data.depth_range import middle_depths
@@ -135,10 +135,8 @@ def painted(name: str, height: int, width: int, depth_range: tuple[float, float]
     """Return a painted scene; ``leaves`` is the number of dead leaves."""
     if name == "dead leaves":
         image, depth = dead_leaves(height, width, depth_range=depth_range, num_leaves=leaves, seed=seed)
-    elif name == "photographic leaves":
-        image, depth = photographic_leaves(height, width, depth_range=depth_range, seed=seed)
     else:
-        image, depth = chart(height, width, depth_range)
+        image, depth = photographic_leaves(height, width, depth_range=depth_range, seed=seed)
     return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
 
 

@@ -7,7 +7,7 @@ import socket
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from kornia_tidy.cli.app.guard import host_name
 from kornia_tidy.cli.commands.parser import Parsed
@@ -31,17 +31,16 @@ class App:
     Args:
         port: of the page. None: the first free one from 7860 on.
         allow_host: names of the page in requests, besides localhost, 127.0.0.1 and [::1]. None: no others.
+
+    Examples:
+        kornia-tidy app                 then open the address that it prints
+        kornia-tidy app --port 8080
+        ssh -L 7860:localhost:7860 HOST   the page of another machine, at localhost:7860
+        kornia-tidy app --allow-host lab.example    behind a proxy of that name
     """
 
     port: Annotated[int, Unit("N", "", PORTS[0], PORTS[-1])] | None = None
     allow_host: tuple[Annotated[str, Parsed("NAME", read=host_name)], ...] = ()
-
-    examples: ClassVar = """\
-  kornia-tidy app                 then open the address that it prints
-  kornia-tidy app --port 8080
-  ssh -L 7860:localhost:7860 HOST   the page of another machine, at localhost:7860
-  kornia-tidy app --allow-host lab.example    behind a proxy of that name
-"""
 
     def run(self) -> None:
         """Make the page, and serve it until it is interrupted.

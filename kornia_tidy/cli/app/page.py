@@ -9,9 +9,8 @@ from typing import Any
 
 from kornia_tidy.cli.app.answers import PICTURES, Answer, answer
 from kornia_tidy.cli.app.capture import Tell
-from kornia_tidy.cli.app.controls import CONTROLS, Control, Group, shown
 from kornia_tidy.cli.app.guard import LARGEST_UPLOAD, Guard
-from kornia_tidy.cli.app.settings import SIDES, Settings
+from kornia_tidy.cli.app.settings import CONTROLS, SIDES, Control, Group, Settings, shown
 from kornia_tidy.files import write_bytes
 from kornia_tidy.search_path import missing
 

@@ -1,59 +1,15 @@
-"""Scenes of the app: painted ones, a test chart at several depths, and image and depth files made smaller."""
+"""Scenes of the app in files: image and depth, made smaller."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from kornia_tidy.data.depth_files import read_depth
 from kornia_tidy.data.image_files import read_image
 from kornia_tidy.data.rgbd import Scene
 
-STEPS = 5  # depths of the chart
-SPOKES = 18  # dark sectors of a star
 PLAUSIBLE = (5e-3, 200.0)  # m; a middle depth outside is probably in another unit
-
-
-def chart(height: int, width: int, depth_range: tuple[float, float] = (0.3, 10.0)) -> tuple[Tensor, Tensor]:
-    """Draw a test chart: a star of radial spokes above bars of falling width, at each of five depths.
-
-    Args:
-        height: rows in pixels.
-        width: columns in pixels.
-        depth_range: nearest and farthest depth in metres; the farthest may be ``inf``. The five depths are evenly
-            spaced in inverse depth, the nearest at the left.
-
-    Returns:
-        The image (3, H, W) in [0, 1], encoded as sRGB, and the depth (1, H, W) in metres.
-
-    Source: ISO 12233, for the star (Siemens star).
-
-    Example:
-        >>> image, depth = chart(60, 80, (0.5, 2.0))
-        >>> image.shape, depth[0, 0, ::16]
-        (torch.Size([3, 60, 80]), tensor([0.5000, 0.6154, 0.8000, 1.1429, 2.0000]))
-    """
-    near, far = (1 / end for end in depth_range)
-    y, x = np.mgrid[:height, :width]
-    step = x * STEPS // width
-    across = (x * STEPS % width + 0.5 * STEPS) / width - 0.5  # -0.5 to 0.5 in each strip, alike to the last bit
-    down = (y + 0.5) / height
-    strip = width / STEPS
-    radius = np.hypot(across * strip, y + 0.5 - 0.3 * height)
-    star = np.cos(SPOKES * np.arctan2(y + 0.5 - 0.3 * height, across * strip))
-    period = np.select([down < 0.72, down < 0.81, down < 0.9], [0.4 * strip, 0.2 * strip, 0.1 * strip], 0.05 * strip)
-    bars = np.cos(2 * np.pi * across * strip / period)
-    ink = np.where(down < 0.6, np.where(radius < 0.42 * min(strip, 0.55 * height), star, -1.0), bars)
-    ink = np.where((np.abs(across) > 0.44) | (down > 0.97), -1.0, ink) > 0
-    paper = np.array([[0.93, 0.9, 0.82], [0.8, 0.9, 0.93], [0.93, 0.84, 0.84], [0.84, 0.92, 0.84], [0.9, 0.88, 0.93]])
-    color = np.where(ink[..., None], 0.12, paper[step])
-    dioptres = torch.from_numpy(near + (far - near) * step / (STEPS - 1))
-    image = torch.from_numpy(np.ascontiguousarray(color.transpose(2, 0, 1))).float()
-    return image, dioptres.reciprocal().float()[None]
 
 
 def read_files(
@@ -76,6 +32,7 @@ def read_files(
 
     Example:
         >>> import tempfile
+        >>> import torch
         >>> from kornia_tidy.data import write_depth, write_image
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_image(f"{folder}/image.png", torch.rand(3, 40, 60))

@@ -1,31 +1,176 @@
-"""Settings of the app: scene, camera, masks and capture as plain values in SI units."""
+"""Settings of the app as plain values in SI units, each with its control: label, unit, range and explanation."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from typing import Any, Literal
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.choices import LENSES, REPLACED, STARTS
+from kornia_tidy.choices import COMPOSITING, LENSES, REPLACED, STARTS
 from kornia_tidy.data.dead_leaves import MOST_LEAVES, PIXELS_A_LEAF
 from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, check_shipped
 from kornia_tidy.reconstruction.settings import MaskSettings
-from kornia_tidy.render.compositing import COMPOSITING
+
+Kind = Literal["choice", "number", "whole", "slider", "check", "file"]
+Group = Literal["scene", "painted scene", "files", "painted depths", "camera", "own camera", "capture", "more"]
 
 LENS = ThinLensCamera()
-OWN, FLAT, FILES, CHART = "own", "flat", "files", "test chart"
-SCENES = ("dead leaves", "photographic leaves", CHART, FILES)
-CAMERAS = (*PRETRAINED, *SYSTEMS, OWN)
+OWN, FLAT, FILES = "own", "flat", "files"
 AS_SYSTEM = "system"
 IDEAL = "ideal"
 MOST_MASKS, STARTED_MASKS = 16, 5
 SIDES = (96, 768)  # pixels
-MOST_NOISE = 0.5  # of full scale; more leaves no picture
 SEEDS = 2**31
 ASPECT = 0.75  # rows of a painted scene for each column
+TASKS = {"joint": "image, depth", "edof": "image"}
+SCENES = {"dead leaves": "dead leaves", "photographic leaves": "photographic leaves", FILES: "your photo and depth map"}
+STARTS_IN_WORDS = {
+    FLAT: "flat (a plain lens)",
+    "noise": "noise",
+    "like fishers": "like fishers (for depth)",
+    "focal sweep": "focal sweep (for the image)",
+}
+UNITS = (
+    ("metres", 1.0),
+    ("centimetres", 0.01),
+    ("millimetres", 0.001),
+    ("1/5000 metre (TUM, ICL-NUIM)", 0.0002),
+    ("1/256 metre (KITTI)", 1 / 256),
+)
+
+
+@dataclass(frozen=True)
+class Control:
+    """A control of the page for one setting.
+
+    Args:
+        name: of the setting.
+        default: of the setting.
+        label: with its unit.
+        kind: of the control.
+        group: of the page.
+        info: explanation.
+        choices: labels and values.
+        low: smallest number, in the unit of the label.
+        high: largest number.
+        step: of a slider.
+        per_unit: power of ten from the unit in the label to that of the setting: -3 for millimetres and metres.
+    """
+
+    name: str
+    default: Any
+    label: str
+    kind: Kind
+    group: Group
+    info: str = ""
+    choices: Sequence[tuple[str, Any]] = ()
+    low: float | None = None
+    high: float | None = None
+    step: float | None = None
+    per_unit: int = 0
+
+    @property
+    def value(self) -> Any:
+        """Default, in the unit of the label."""
+        return self.shown(self.default)
+
+    def shown(self, setting: Any) -> Any:
+        """Return a value of the setting in the unit of the label."""
+        return setting if self.per_unit == 0 else _scaled(Decimal(repr(setting)), -self.per_unit)
+
+    def check(self, setting: Any) -> None:
+        """Raise ``ValueError`` if a value of the setting is none of the choices, or beyond the range."""
+        if isinstance(setting, str) and self.choices:
+            check_choice(self.label, setting, tuple(value for _, value in self.choices))
+        if self.low is None or self.high is None:
+            return
+        if not self.low <= (number := self.shown(setting)) <= self.high:
+            allowed = f"from {self.low:.12g} to {self.high:.12g}"
+            raise ValueError(f"{self.label}: give a number {allowed}, got {number:.6g}")
+
+    def setting(self, value: Any) -> Any:
+        """Return a value of the control as the value of the setting.
+
+        Raises:
+            ValueError: if a number is missing, is not a number, or is not whole where it must be.
+
+        Example:
+            >>> by_name("noise").setting(0.00001), by_name("pixel_pitch").setting("3,45")
+            (1e-07, 3.45e-06)
+        """
+        if self.kind in {"choice", "check", "file"}:
+            return value
+        if value is None:
+            raise ValueError(f"{self.label}: give a number")
+        try:
+            number = Decimal(str(value).strip().replace(",", "."))
+        except InvalidOperation:
+            number = Decimal("nan")
+        if not (number.is_finite() and math.isfinite(float(number))):
+            raise ValueError(f"{self.label}: give a number, got {value!s:.40}")
+        if not isinstance(self.default, int):
+            return _scaled(number, self.per_unit)
+        if number != number.to_integral_value():
+            raise ValueError(f"{self.label}: give a whole number, got {value!s:.40}")
+        return int(number)
+
+
+def _scaled(number: Decimal, power: int) -> float:
+    """Return a number times a power of ten, rounded once."""
+    sign, digits, exponent = number.as_tuple()
+    assert isinstance(exponent, int)  # of finite numbers
+    return float(Decimal((sign, digits, exponent + power)))
+
+
+def camera_name(name: str) -> str:
+    """Return a system as a user sees it in the list of cameras.
+
+    Example:
+        >>> camera_name("edof-5"), camera_name("joint-uncertain"), camera_name("ikoma2021")
+        ('trained edof-5: image, K = 5', 'trained joint-uncertain', 'published: Ikoma et al.')
+    """
+    if name == OWN:
+        return "your own lens and masks"
+    if name in SYSTEMS:
+        return f"published: {SYSTEMS[name].title}"
+    task, _, masks = name.partition("-")
+    if task not in TASKS or not masks.isdigit():
+        return f"trained {name}"
+    return f"trained {name}: {TASKS[task]}, K = {masks}"
+
+
+CAMERAS = (*PRETRAINED, *SYSTEMS, OWN)
+INFOS = {
+    "camera": "Trained systems come with a network. The network any-camera restores the others, without depth.",
+    "f_number": "Focal length over aperture. Smaller is a wider aperture: more blur out of focus.",
+    "fit": "Its depths then have a defocus of -20 to +20 rad.",
+    "lens": "A real lens has its own focal length, and its PSFs vary over the picture.",
+    "place": "0 is the middle; at 100 a corner of the picture is at the edge of the field.",
+    "compositing": "Gather blurs each pixel by its depth, scatter spreads its light, and occlusion also hides.",
+    "noise": "Standard deviation in linear light.",
+    "stretch": "Linear in inverse depth. Your own lens takes the range of the scene instead.",
+}
+"""Explanations of settings."""
+CHOICES: dict[str, Sequence[tuple[str, Any]]] = {
+    "scene": [(words, name) for name, words in SCENES.items()],
+    "depth_scale": UNITS,
+    "camera": [(camera_name(name), name) for name in CAMERAS],
+    "lens": [("ideal", IDEAL), *((name, name) for name in LENSES)],
+    "start": [(STARTS_IN_WORDS.get(name, name), name) for name in (FLAT, *STARTS)],
+    "compositing": [("as the system has it", AS_SYSTEM), *((name, name) for name in COMPOSITING)],
+}
+"""Labels and values."""
+
+
+def _control(default: Any, label: str, kind: Kind, group: Group, **limits: Any) -> Any:
+    """Return the field of a setting with its control."""
+    return field(default=default, metadata={"label": label, "kind": kind, "group": group, **limits})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +178,7 @@ class Settings:
     """Settings of one capture in the app.
 
     Args:
-        scene: ``"dead leaves"``, ``"photographic leaves"``, ``"test chart"``, or ``"files"`` for image and depth files.
+        scene: ``"dead leaves"``, ``"photographic leaves"``, or ``"files"`` for image and depth files.
         seed: of the painted scene.
         side: longer side of the picture in pixels; larger files are made smaller.
         image_file: picture of the scene ``"files"``.
@@ -69,32 +214,55 @@ class Settings:
         >>> Settings(noise=-1)
         Traceback (most recent call last):
         ...
-        ValueError: the read noise must be from 0 to 50 % of full scale, got -100 %
+        ValueError: Read noise (% of full scale): give a number from 0 to 5, got -100
     """
 
-    scene: str = "dead leaves"
-    seed: int = 0
-    side: int = 320
-    image_file: str | None = None
-    depth_file: str | None = None
-    depth_scale: float = 1.0
-    stretch: bool = True
-    near: float = 0.3
-    far: float = 10.0
-    camera: str = "joint-uncertain"
-    f_number: float = round(LENS.f_number, 1)
-    focus_distance: float = float(LENS.focus_distance)
-    focal_length: float = LENS.focal_length
-    pixel_pitch: float = LENS.pixel_pitch
-    lens: str = IDEAL
-    place: float = 0.0
-    fit: bool = False
-    start: str = "like fishers"
-    masks: int = MaskSettings.masks
-    mask_seed: int = 0
-    compositing: str = AS_SYSTEM
-    noise: float = 0.002
-    noise_seed: int = 0
+    scene: str = _control("dead leaves", "Scene", "choice", "scene")
+    image_file: str | None = _control(None, "Photo (PNG, TIFF, JPEG)", "file", "files")
+    depth_file: str | None = _control(
+        None, "Its depth map (16-bit PNG, TIFF, PGM, PFM, NPY, NPZ, OpenEXR)", "file", "files"
+    )
+    depth_scale: float = _control(1.0, "Unit of the depth map", "choice", "files")
+    seed: int = _control(0, "Number of the painted scene", "whole", "painted scene", low=0, high=SEEDS - 1)
+    camera: str = _control("joint-uncertain", "Camera", "choice", "camera")
+    f_number: float = _control(round(LENS.f_number, 1), "f-number", "slider", "own camera", low=2, high=32, step=0.1)
+    focus_distance: float = _control(
+        float(LENS.focus_distance), "Focus distance (m)", "number", "own camera", low=0.06, high=1000
+    )
+    fit: bool = _control(False, "Choose aperture and focus for the scene", "check", "own camera")
+    focal_length: float = _control(
+        LENS.focal_length, "Focal length (mm)", "number", "own camera", low=1, high=1000, per_unit=-3
+    )
+    lens: str = _control(IDEAL, "Lens", "choice", "own camera")
+    place: float = _control(
+        0.0,
+        "Place of the picture in a real lens's field (%)",
+        "slider",
+        "own camera",
+        low=0,
+        high=100,
+        step=5,
+        per_unit=-2,
+    )
+    pixel_pitch: float = _control(
+        LENS.pixel_pitch, "Pixel pitch (µm)", "number", "own camera", low=0.5, high=50, per_unit=-6
+    )
+    start: str = _control("like fishers", "Masks", "choice", "own camera")
+    masks: int = _control(
+        MaskSettings.masks, "Masks in one exposure, K", "slider", "own camera", low=1, high=MOST_MASKS, step=1
+    )
+    compositing: str = _control(AS_SYSTEM, "Compositing at depth edges", "choice", "capture")
+    noise: float = _control(
+        0.002, "Read noise (% of full scale)", "slider", "capture", low=0, high=5, step=0.05, per_unit=-2
+    )
+    stretch: bool = _control(True, "Stretch the depths over the camera's range", "check", "more")
+    near: float = _control(0.3, "Nearest painted depth (m)", "number", "painted depths", low=0.05, high=1000)
+    far: float = _control(10.0, "Farthest painted depth (m)", "number", "painted depths", low=0.05, high=10000)
+    side: int = _control(
+        320, "Longer side of the picture (pixels)", "slider", "more", low=SIDES[0], high=SIDES[1], step=32
+    )
+    mask_seed: int = _control(0, "Seed of random masks", "whole", "more", low=0, high=SEEDS - 1)
+    noise_seed: int = _control(0, "Seed of the sensor's noise", "whole", "more", low=0, high=SEEDS - 1)
 
     @property
     def painted_size(self) -> tuple[int, int]:
@@ -108,29 +276,10 @@ class Settings:
         return min(MOST_LEAVES, max(1, height * width // PIXELS_A_LEAF))
 
     def __post_init__(self) -> None:
-        check_choice("the scene", self.scene, SCENES)
         if self.camera in REPLACED:
             check_shipped(self.camera)
-        check_choice("the camera", self.camera, CAMERAS)
-        check_choice("compositing", self.compositing, (AS_SYSTEM, *COMPOSITING))
-        check_choice("the lens", self.lens, (IDEAL, *LENSES))
-        if not 0 <= self.place <= 1:
-            raise ValueError(f"the place in the field must be from 0 to 100 %, got {100 * self.place:g} %")
-        check_choice("the masks' start", self.start, (FLAT, *STARTS))
-        for name in ("seed", "mask_seed", "noise_seed"):
-            if not 0 <= getattr(self, name) < SEEDS:
-                raise ValueError(f"a seed must be a whole number from 0 to {SEEDS - 1}, got {getattr(self, name)}")
-        if not SIDES[0] <= self.side <= SIDES[1]:
-            raise ValueError(f"the longer side must be from {SIDES[0]} to {SIDES[1]} pixels, got {self.side}")
-        if not 0 <= self.noise <= MOST_NOISE:
-            raise ValueError(
-                f"the read noise must be from 0 to {100 * MOST_NOISE:g} % of full scale, got {100 * self.noise:g} %"
-            )
-        self._check_scene()
-        if self.camera == OWN:
-            self._check_camera()
-
-    def _check_scene(self) -> None:
+        for control in CONTROLS:
+            control.check(getattr(self, control.name))
         if self.scene == FILES:
             for path, what in ((self.image_file, "a photo"), (self.depth_file, "the depth map of the photo")):
                 if path is None:
@@ -142,13 +291,49 @@ class Settings:
             raise ValueError(
                 f"the nearest depth must be positive and below the farthest, got {self.near:g} m and {self.far:g} m"
             )
-
-    def _check_camera(self) -> None:
-        if not 1 <= self.masks <= MOST_MASKS:
-            raise ValueError(f"the number of masks K must be from 1 to {MOST_MASKS}, got {self.masks}")
-        if self.start not in {FLAT, "noise"} and self.masks > STARTED_MASKS:
+        if self.camera == OWN and self.start not in {FLAT, "noise"} and self.masks > STARTED_MASKS:
             raise ValueError(
                 f"the masks {self.start!r} are {STARTED_MASKS} at most, got K = {self.masks}; 'noise' has any number"
             )
-        check_positive("the f-number", self.f_number)
-        check_positive("the focal length", self.focal_length, "metres")
+
+
+CONTROLS = tuple(
+    Control(one.name, one.default, **one.metadata, info=INFOS.get(one.name, ""), choices=CHOICES.get(one.name, ()))
+    for one in fields(Settings)
+)
+
+
+def settings_of(values: Mapping[str, Any]) -> Settings:
+    """Return the settings of the values of controls by name, in the units of their labels; missing ones are default.
+
+    Raises:
+        ValueError: if a number is missing, or a value is not allowed.
+
+    Example:
+        >>> settings_of({"focal_length": 35, "noise": 1.0}).focal_length
+        0.035
+    """
+    return Settings(**{name: by_name(name).setting(value) for name, value in values.items()})
+
+
+def by_name(name: str) -> Control:
+    """Return the control of a setting."""
+    return next(control for control in CONTROLS if control.name == name)
+
+
+def shown(group: Group, scene: str, camera: str, stretch: bool) -> bool:
+    """Return whether a group of controls has an effect, and so is shown.
+
+    Example:
+        >>> shown("files", "dead leaves", "edof-5", stretch=True), shown("own camera", "dead leaves", "own", True)
+        (False, True)
+    """
+    if group == "files":
+        return scene == FILES
+    if group == "painted scene":
+        return scene != FILES
+    if group == "own camera":
+        return camera == OWN
+    if group == "painted depths":
+        return scene != FILES and (camera == OWN or not stretch)
+    return True

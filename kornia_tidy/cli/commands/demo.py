@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import MASK_FAMILIES
 from kornia_tidy.cli.commands.shared import Folder, OwnScene, check_folder
@@ -44,6 +44,12 @@ class Demo:
         size: side of the scene made here.
         seed: of scene and noise.
         scene: to be photographed.
+
+    Examples:
+        kornia-tidy demo
+        kornia-tidy demo --electrons 500                                      dim light
+        kornia-tidy demo --masks 3 --family spiral --f-number 12              a camera made up here
+        kornia-tidy demo --image photo.png --depth depth.png --depth-scale 0.001
     """
 
     output: Folder = "outputs"
@@ -54,13 +60,6 @@ class Demo:
     size: Pixels = 512
     seed: Seed = 5  # of a scene of many kinds of texture
     scene: OwnScene = field(default_factory=OwnScene)
-
-    examples: ClassVar = """\
-  kornia-tidy demo
-  kornia-tidy demo --electrons 500                                      dim light
-  kornia-tidy demo --masks 3 --family spiral --f-number 12              a camera made up here
-  kornia-tidy demo --image photo.png --depth depth.png --depth-scale 0.001
-"""
 
     def run(self) -> None:
         """Simulate captures, restore them, and write the two pages."""

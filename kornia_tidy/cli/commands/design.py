@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from kornia_tidy.choices import BETWEEN
 from kornia_tidy.cli.commands.shared import Folder, check_folder
@@ -48,7 +48,7 @@ class ModulatorSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Design aperture, focus and masks together, and see whether masks pay.
+    r"""Design aperture, focus and masks together, and see whether masks pay.
 
     The aim is extended depth of field, depth, or both. A wide aperture with masks gets
     more light, a lens that is stopped down is sharper over a larger range of depths: which
@@ -75,6 +75,33 @@ class Design:
             "depth": "*_depth.png", "scale": 0.001}. None: only dead leaves.
         given: scene, lens and sensor.
         modulator: what shows the masks.
+
+    Notes:
+        FOLDER gets design.png (look at this first), report.json (every camera that was compared),
+        masks.npy (heights of the best masks in metres) and camera.safetensors (the recommended
+        camera):
+          kornia-tidy masks export FOLDER/camera.safetensors -o slm      frames for a modulator
+          kornia-tidy psf FOLDER/camera.safetensors --aperture-diameter A --focus-distance Z
+        its PSFs, with the aperture and the focus that are printed at the end.
+
+        How many electrons? The full well of the pixel if white nearly saturates it. Else roughly
+          500 * illuminance in lux * exposure in seconds * (pixel pitch in um)^2 / f-number^2
+        at a quantum efficiency of one half: 17,000 lux (day, in the shade) for 33 ms on 8 um
+        pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
+
+    Examples:
+        The camera of the paper in bright light, a first answer:
+          kornia-tidy design --quick
+
+        A range of 0.5 to 4 m in dim light, with a modulator of 8 bits that takes 4 ms:
+          kornia-tidy design --depth-range 0.5 4 --electrons 5000 --bits 8 \
+              --switching-time 4e-3 --exposure 33e-3 -o outputs/dim
+
+        Behind a real lens, scored over its field:
+          kornia-tidy design --lens single-50mm --quick -o outputs/single
+
+        Image and depth count alike; your own scenes decide too:
+          kornia-tidy design --depth-weight 0.5 --scenes my/scenes -o outputs/both
     """
 
     output: Folder = "outputs/design"
@@ -83,34 +110,6 @@ class Design:
     scenes: Folder | None = None
     given: DesignSettings = field(default_factory=DesignSettings)
     modulator: ModulatorSettings = field(default_factory=ModulatorSettings)
-
-    notes: ClassVar = """\
-FOLDER gets design.png (look at this first), report.json (every camera that was compared),
-masks.npy (heights of the best masks in metres) and camera.safetensors (the recommended
-camera):
-  kornia-tidy masks export FOLDER/camera.safetensors -o slm      frames for a modulator
-  kornia-tidy psf FOLDER/camera.safetensors --aperture-diameter A --focus-distance Z
-its PSFs, with the aperture and the focus that are printed at the end.
-
-How many electrons? The full well of the pixel if white nearly saturates it. Else roughly
-  500 * illuminance in lux * exposure in seconds * (pixel pitch in um)^2 / f-number^2
-at a quantum efficiency of one half: 17,000 lux (day, in the shade) for 33 ms on 8 um
-pixels give 57,000 at f/17.6, and 300 lux (a room) give 1,000.
-"""
-    examples: ClassVar = """\
-  The camera of the paper in bright light, a first answer:
-    kornia-tidy design --quick
-
-  A range of 0.5 to 4 m in dim light, with a modulator of 8 bits that takes 4 ms:
-    kornia-tidy design --depth-range 0.5 4 --electrons 5000 --bits 8 \\
-        --switching-time 4e-3 --exposure 33e-3 -o outputs/dim
-
-  Behind a real lens, scored over its field:
-    kornia-tidy design --lens single-50mm --quick -o outputs/single
-
-  Image and depth count alike; your own scenes decide too:
-    kornia-tidy design --depth-weight 0.5 --scenes my/scenes -o outputs/both
-"""
 
     def task(self) -> DesignTask:
         """Return the task that the settings describe.

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
-from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.cli.commands.parser import Argument, Given
 from kornia_tidy.cli.commands.shared import File, Folder, Noise, check_folder, read_noise
-from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.settings import Count, CountOrNone, Seed
 from kornia_tidy.training.settings import SceneSettings, TrainingSettings
 
@@ -49,6 +47,15 @@ class Evaluate:
         pictures: scenes drawn.
         noise_seed: of the sensor.
         settings: of the scenes.
+
+    Notes:
+        Shipped systems: joint-uncertain, edof-5, edof-designed, edof-flat.
+        Closed forms: tikhonov, tikhonov-bilateral, wiener, wiener-bilateral, any-camera.
+
+    Examples:
+        kornia-tidy evaluate outputs/edof/best.safetensors
+        kornia-tidy evaluate edof-5 --data dead-leaves --scenes 8 -o outputs/edof-5
+        kornia-tidy evaluate wiener-bilateral --psfs bank.safetensors --noise iso800.json -o outputs/mine
     """
 
     system: Annotated[str, Argument("SYSTEM")]
@@ -61,16 +68,6 @@ class Evaluate:
     settings: Annotated[dict[str, Any], Given(SceneSettings, only=("data", "root", "size"), stored=True)] = field(
         default_factory=dict
     )
-
-    notes: ClassVar = f"""\
-Shipped systems: {", ".join(PRETRAINED)}.
-Closed forms: {", ".join(CLOSED_FORMS)}.
-"""
-    examples: ClassVar = """\
-  kornia-tidy evaluate outputs/edof/best.safetensors
-  kornia-tidy evaluate edof-5 --data dead-leaves --scenes 8 -o outputs/edof-5
-  kornia-tidy evaluate wiener-bilateral --psfs bank.safetensors --noise iso800.json -o outputs/mine
-"""
 
     def run(self) -> None:
         """Evaluate the system, write results and pictures, and print a summary."""

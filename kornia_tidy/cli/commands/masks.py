@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import FLIPS, MATERIALS, ROTATIONS
 from kornia_tidy.cli.commands.parser import Argument
@@ -99,7 +99,7 @@ class ShowMasks:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportMasks:
-    """Write SLM frames or heights.
+    r"""Write SLM frames or heights.
 
     A state_dict tells the masks' family, constraint and material, and the modulator; its
     grey levels, dwell and switching times are the defaults of frames. One of only masks (phase in radians at 530 nm)
@@ -120,6 +120,14 @@ class ExportMasks:
             panel pixels per mask pixel.
         panel: of frames.
         timing: of frames.
+
+    Examples:
+        Frames for a 1920 x 1200 panel, seen through a mirror:
+          kornia-tidy masks export camera.safetensors -o slm --flip left-right
+
+        A 10-bit panel with a measured response and swaps of 4 ms:
+          kornia-tidy masks export heights.npy -o slm --bits 10 --response lut.csv \
+              --exposure 0.1 --switching-time 0.004 --wavelength 532e-9
     """
 
     masks: MasksFile
@@ -129,15 +137,6 @@ class ExportMasks:
     pupil_radius: Metres | None = None
     panel: Panel = field(default_factory=Panel)
     timing: Timing = field(default_factory=Timing)
-
-    examples: ClassVar = """\
-  Frames for a 1920 x 1200 panel, seen through a mirror:
-    kornia-tidy masks export camera.safetensors -o slm --flip left-right
-
-  A 10-bit panel with a measured response and swaps of 4 ms:
-    kornia-tidy masks export heights.npy -o slm --bits 10 --response lut.csv \\
-        --exposure 0.1 --switching-time 0.004 --wavelength 532e-9
-"""
 
     def run(self) -> None:
         """Export masks as SLM frames or heights, by the name of the output."""

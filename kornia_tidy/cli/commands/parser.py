@@ -1,9 +1,9 @@
 """Options of a command from its settings: names, units, ranges, defaults and purposes are those of the dataclass.
 
-A command is a dataclass of settings with a method ``run`` and, if it likes, two class variables: ``examples``, and
-``basic`` names, without which an option stands in ``--help-all`` only. A field that is a dataclass itself is a group of
-options; a field ``Annotated[dict, Given(Settings)]`` holds those of the settings that were given, by name. The field
-``output`` is also ``-o``.
+A command is a dataclass of settings with a method ``run``. Its docstring may have the sections ``Notes`` and
+``Examples``; options that are not among its ``basic`` names stand in ``--help-all`` only. A field that is a dataclass
+itself is a group of options; a field ``Annotated[dict, Given(Settings)]`` holds those of the settings that were given,
+by name. The field ``output`` is also ``-o``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataclasses import MISSING, dataclass, is_dataclass
 from functools import partial
 from typing import Any, NoReturn, get_args
 
-from kornia_tidy.settings import Choice, Setting, Unit, documented, settings_of
+from kornia_tidy.settings import Choice, Setting, Unit, documented, section, settings_of
 
 WIDEST = 40  # characters of choices that stand in braces behind an option
 
@@ -99,13 +99,13 @@ def read(command: type, argv: Sequence[str], prog: str) -> Any:
 def make_parser(command: type, prog: str, everything: bool = False) -> Parser:
     """Return the parser of a command, whose help shows everything, or the basic options in brief."""
     summary, text, _ = documented(command)
-    notes, basic = getattr(command, "notes", ""), getattr(command, "basic", None)
+    notes, basic = section(command, "Notes"), getattr(command, "basic", None)
     brief = not everything and bool(notes or basic)
-    examples = getattr(command, "examples", "").rstrip().split("\n\n")[: 2 if brief else None]
+    examples = section(command, "Examples").split("\n\n")[: 2 if brief else None]
     parser = Parser(
         prog=prog,
         description="\n\n".join(filter(None, [summary, text, "" if brief else notes])),
-        epilog="examples:\n" + "\n\n".join(examples) if examples != [""] else None,
+        epilog="examples:\n" + textwrap.indent("\n\n".join(examples), "  ") if examples != [""] else None,
         formatter_class=partial(_Formatter, max_help_position=26),
         argument_default=argparse.SUPPRESS,
         add_help=False,

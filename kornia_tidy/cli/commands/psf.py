@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import SYSTEMS, Preset
 from kornia_tidy.cli.commands.lens_option import RealLens, camera_and_lens
@@ -79,6 +79,14 @@ class Psf:
         lens: a real lens by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json). None: an ideal
             lens, or as saved.
         field: number of heights on the sensor from the axis to the corner that the lens is made for. None: the axis.
+
+    Examples:
+        kornia-tidy psf phasecam3d
+        kornia-tidy psf runs/edof/best.safetensors --depths 0.4,0.6,1,inf -o psfs.png
+        kornia-tidy psf heights.npy --focus-distance 1 --aperture-diameter 4e-3
+        kornia-tidy psf --lens double-gauss-50mm --f-number 8 --focus-distance 1 --field 5
+        kornia-tidy psf --lens lens.zmx --f-number 4 --focus-distance 2 --field 5
+        kornia-tidy psf tidy-5 --lens single-50mm --field 3 --depths 0.4,0.6,inf
     """
 
     camera: Annotated[str, Argument("CAMERA")] | None = None
@@ -90,15 +98,6 @@ class Psf:
     settings: LensSettings = dataclasses.field(default_factory=LensSettings)
     lens: RealLens | None = None
     field: Count | None = None
-
-    examples: ClassVar = """\
-  kornia-tidy psf phasecam3d
-  kornia-tidy psf runs/edof/best.safetensors --depths 0.4,0.6,1,inf -o psfs.png
-  kornia-tidy psf heights.npy --focus-distance 1 --aperture-diameter 4e-3
-  kornia-tidy psf --lens double-gauss-50mm --f-number 8 --focus-distance 1 --field 5
-  kornia-tidy psf --lens lens.zmx --f-number 4 --focus-distance 2 --field 5
-  kornia-tidy psf tidy-5 --lens single-50mm --field 3 --depths 0.4,0.6,inf
-"""
 
     def run(self) -> None:
         """Compute the PSFs, print their numbers and draw them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from kornia_tidy.cli.commands.parser import Optional
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
@@ -33,6 +33,18 @@ class CalibrateNoise:
         dark: captures without light: black is measured in them. None: black as the files say.
         plot: picture of the photon-transfer curve. None: OUT.png, if matplotlib is installed.
         dump: layout of a headerless file.
+
+    Notes:
+        In Python:
+          from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
+          sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
+
+    Examples:
+        Pairs of flats at ISO 800, with two captures under the lens cap:
+          kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json
+
+        From a single picture:
+          kornia-tidy raw calibrate-noise street.cr2 -o noise.json
     """
 
     files: RawFiles
@@ -40,19 +52,6 @@ class CalibrateNoise:
     dark: tuple[File, ...] = ()
     plot: Annotated[str, Optional("PNG")] | None = None
     dump: Dump = field(default_factory=Dump)
-
-    notes: ClassVar = """\
-In Python:
-  from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
-  sensor = read_json("iso800.json").sensor_noise()      # for TiDyOptics(sensor=...)
-"""
-    examples: ClassVar = """\
-  Pairs of flats at ISO 800, with two captures under the lens cap:
-    kornia-tidy raw calibrate-noise flats/*.dng --dark cap1.dng cap2.dng -o iso800.json
-
-  From a single picture:
-    kornia-tidy raw calibrate-noise street.cr2 -o noise.json
-"""
 
     def run(self) -> None:
         """Calibrate, write the results, and print a summary."""

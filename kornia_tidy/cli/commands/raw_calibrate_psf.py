@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class CalibratePsf:
-    """Make a PSF bank from pictures of a point.
+    r"""Make a PSF bank from pictures of a point.
 
     The pictures show a point of light at known distances.
     At each distance the point is moved by some pixels and fractions of a pixel between
@@ -49,6 +49,32 @@ class CalibratePsf:
         sensor: its noise.
         lens: of the camera; its depths are the distances.
         dump: layout of a headerless file.
+
+    Notes:
+        The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
+        sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
+        pictures of one distance are consistent. Far larger ones mean that something moved or
+        that --full-well, --read-noise or the black level are wrong. Most of the error of a
+        sharp PSF is noise in its dark surroundings: one more exposure, four times as long,
+        lowers it as much as twice the number of positions. Without --reference each PSF is
+        centred at its centroid, and shifts by the masks are not measured.
+
+        In Python:
+          from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
+          from kornia_tidy.reconstruction import Tikhonov
+          measured = MeasuredPSFs.load("bank.safetensors")  # .bank, .uncertainty, .distances, .reports
+          sharp = Tikhonov()(capture, measured.bank)        # on linear light
+
+    Examples:
+        Three distances, 8 places of the point at each:
+          kornia-tidy raw calibrate-psf d1_*.dng d2_*.dng d3_*.dng \
+              --distances 0.35 0.6 1.5 --noise iso800.json -o bank.safetensors
+
+        Two exposures at each position; the same positions with a flat modulator, which give
+        the position of the chief ray; and retrieval of the mask behind these PSFs:
+          kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \
+              --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \
+              --fit-mask mask.npy
     """
 
     files: RawFiles
@@ -70,32 +96,6 @@ class CalibratePsf:
         *("files", "distances", "output", "exposures", "reference", "window", "points", "picture", "fit_mask", "noise"),
         *("full_well", "read_noise", "focal_length", "f_number", "focus_distance", "pixel_pitch"),
     )
-    notes: ClassVar = """\
-The printed numbers show the accuracy of the bank. "noise" is the expected error, as the
-sum of its moduli relative to the PSF's light. "residuals" of about 1 mean that the
-pictures of one distance are consistent. Far larger ones mean that something moved or
-that --full-well, --read-noise or the black level are wrong. Most of the error of a
-sharp PSF is noise in its dark surroundings: one more exposure, four times as long,
-lowers it as much as twice the number of positions. Without --reference each PSF is
-centred at its centroid, and shifts by the masks are not measured.
-
-In Python:
-  from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
-  from kornia_tidy.reconstruction import Tikhonov
-  measured = MeasuredPSFs.load("bank.safetensors")  # .bank, .uncertainty, .distances, .reports
-  sharp = Tikhonov()(capture, measured.bank)        # on linear light
-"""
-    examples: ClassVar = """\
-  Three distances, 8 places of the point at each:
-    kornia-tidy raw calibrate-psf d1_*.dng d2_*.dng d3_*.dng \\
-        --distances 0.35 0.6 1.5 --noise iso800.json -o bank.safetensors
-
-  Two exposures at each position; the same positions with a flat modulator, which give
-  the position of the chief ray; and retrieval of the mask behind these PSFs:
-    kornia-tidy raw calibrate-psf p*.tif --distances 0.35 0.6 1.5 --exposures 0.01 0.08 \\
-        --full-well 10500 --read-noise 2.4 --reference flat*.tif -o bank.safetensors \\
-        --fit-mask mask.npy
-"""
 
     def run(self) -> None:
         """Measure the PSFs and write the bank."""

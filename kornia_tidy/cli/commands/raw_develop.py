@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from kornia_tidy.choices import DEMOSAIC, HIGHLIGHTS
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles, WhiteBalance, white_balance
@@ -17,7 +17,7 @@ Format = Annotated[str, one_of(("png", "tiff"))]
 
 @dataclass(frozen=True, kw_only=True)
 class DevelopRaw:
-    """Make pictures of raw files.
+    r"""Make pictures of raw files.
 
     Black and white levels, white balance, demosaicing, colour conversion to sRGB, upright
     orientation and square pixels. Nothing is brightened, sharpened or denoised. Each FILE
@@ -37,6 +37,27 @@ class DevelopRaw:
         linear: linear light in the 16-bit picture, not encoded as sRGB.
         sensor_grid: pixels as on the sensor: neither turned nor stretched.
         dump: layout of a headerless file.
+
+    Notes:
+        The first example in Python:
+          from kornia_tidy.data.image_files import write_image
+          from kornia_tidy.lab.raw.capture import RawCapture
+          from kornia_tidy.lab.raw.develop import develop
+          write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
+
+    Examples:
+        All files of a folder; if interrupted, go on with --resume:
+          kornia-tidy raw develop shots/*.dng -o pictures
+
+        For measurements: linear light on the pixel grid of the sensor, without interpolation:
+          kornia-tidy raw develop shots/*.dng -o planes --demosaic half --linear --sensor-grid
+
+        Files without a white balance, which look green or orange:
+          kornia-tidy raw develop quicktake/*.qtk -o pictures --white-balance auto
+
+        A headerless dump of counts, with factors for red, green and blue:
+          kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \
+              --white-balance 1.9 1 1.5 -o pictures
     """
 
     files: RawFiles
@@ -50,28 +71,6 @@ class DevelopRaw:
     linear: bool = False
     sensor_grid: bool = False
     dump: Dump = field(default_factory=Dump)
-
-    examples: ClassVar = """\
-  All files of a folder; if interrupted, go on with --resume:
-    kornia-tidy raw develop shots/*.dng -o pictures
-
-  For measurements: linear light on the pixel grid of the sensor, without interpolation:
-    kornia-tidy raw develop shots/*.dng -o planes --demosaic half --linear --sensor-grid
-
-  Files without a white balance, which look green or orange:
-    kornia-tidy raw develop quicktake/*.qtk -o pictures --white-balance auto
-
-  A headerless dump of counts, with factors for red, green and blue:
-    kornia-tidy raw develop dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520 \\
-        --white-balance 1.9 1 1.5 -o pictures
-"""
-    notes: ClassVar = """\
-The first example in Python:
-  from kornia_tidy.data.image_files import write_image
-  from kornia_tidy.lab.raw.capture import RawCapture
-  from kornia_tidy.lab.raw.develop import develop
-  write_image("pictures/shot.png", develop(RawCapture.open("shots/shot.dng")), bits=16)
-"""
 
     def run(self) -> None:
         """Develop raw files."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
 
@@ -20,18 +19,17 @@ class InfoOfRaw:
     Args:
         files: camera raw files.
         dump: layout of a headerless file.
+
+    Examples:
+        All files of a folder, those that fail are named at the end:
+          kornia-tidy raw info shots/*.dng
+
+        A bare dump of counts, 16 bits each:
+          kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
     """
 
     files: RawFiles
     dump: Dump = field(default_factory=Dump)
-
-    examples: ClassVar = """\
-  All files of a folder, those that fail are named at the end:
-    kornia-tidy raw info shots/*.dng
-
-  A bare dump of counts, 16 bits each:
-    kornia-tidy raw info dump.raw --size 768x512 --pattern RGGB --black 600 --white 15520
-"""
 
     def run(self) -> None:
         """Print the properties of raw files."""

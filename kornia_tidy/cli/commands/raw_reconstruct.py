@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReconstructRaw:
-    """Restore captures: pictures that are sharp everywhere, and depth.
+    r"""Restore captures: pictures that are sharp everywhere, and depth.
 
     A trained network restores them, or a closed form for a camera that was measured or is
     given by lens and masks: tile by tile, within a memory budget, without visible seams.
@@ -82,6 +82,46 @@ class ReconstructRaw:
             the time.
         device: where the network runs, such as cuda.
         dump: layout of a headerless file.
+
+    Notes:
+        Without a network of your camera, give the camera: its file as HEAD, its measured PSFs, or
+        its masks with its lens.
+        One network, any-camera, restores the captures of any camera that it is told. All others fit
+        the camera that they were trained with, its masks and its lens. The library includes, for a
+        50 mm lens and pixels of 8 um
+          edof-5                      picture: five masks; f/17.6, at 0.6 m
+          edof-designed               picture: five masks; f/22, at 1.98 m
+          edof-flat                   picture: no masks; f/48, at 0.74 m
+          joint-uncertain             picture, depth and its uncertainty: five masks; f/28.5, at 0.6 m
+        A network that begins with the closed form, and the closed form itself, take the noise of
+        each pixel: as --noise says, or of raw files with a noise profile (DNG) from it.
+
+        Processing of a raw file: black and white levels, white balance, demosaicing, conversion
+        to linear sRGB clipped to [0, 1], on the pixel grid of the sensor with square pixels,
+        since the PSFs are defined there. Then the encoding of the network's training is applied
+        (sRGB unless --color-space was linear or paper). The results are turned upright.
+
+        Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
+        for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens tiles have
+        384 pixels along a side, whatever --memory and --overlap say.
+
+    Examples:
+        All files of a folder; if interrupted, go on with --resume:
+          kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o sharp --resume
+
+        A better picture, in seven times the time:
+          kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o best --orientations 8
+
+        A camera of your own design, and one that was measured, without training:
+          kornia-tidy raw reconstruct shots/*.dng --head camera.safetensors -o sharp
+          kornia-tidy raw reconstruct shots/*.dng --psfs bank.safetensors --noise iso800.json -o sharp
+
+        The same camera by its masks and its real lens, whose PSFs vary over the picture:
+          kornia-tidy raw reconstruct shots/*.dng --masks heights.npy --lens single-50mm \
+              --f-number 12 --focus-distance 0.7 --noise iso800.json -o sharp
+
+        A network of one's own:
+          kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths
     """
 
     files: RawFiles
@@ -107,46 +147,6 @@ class ReconstructRaw:
         *("files", "output", "head", "psfs", "masks", "lens", "noise", "resume", "format", "depth_unit", "linear"),
         *("white_balance", "memory", "orientations", "device"),
     )
-    notes: ClassVar = """\
-Without a network of your camera, give the camera: its file as HEAD, its measured PSFs, or
-its masks with its lens.
-One network, any-camera, restores the captures of any camera that it is told. All others fit
-the camera that they were trained with, its masks and its lens. The library includes, for a
-50 mm lens and pixels of 8 um
-  edof-5                      picture: five masks; f/17.6, at 0.6 m
-  edof-designed               picture: five masks; f/22, at 1.98 m
-  edof-flat                   picture: no masks; f/48, at 0.74 m
-  joint-uncertain             picture, depth and its uncertainty: five masks; f/28.5, at 0.6 m
-A network that begins with the closed form, and the closed form itself, take the noise of
-each pixel: as --noise says, or of raw files with a noise profile (DNG) from it.
-
-Processing of a raw file: black and white levels, white balance, demosaicing, conversion
-to linear sRGB clipped to [0, 1], on the pixel grid of the sensor with square pixels,
-since the PSFs are defined there. Then the encoding of the network's training is applied
-(sRGB unless --color-space was linear or paper). The results are turned upright.
-
-Memory: --memory for the tiles, about 40 bytes a pixel of each file at work, and 0.4 GiB
-for the program; in all 1.8 GiB for a file of 24 megapixels. Behind a real lens tiles have
-384 pixels along a side, whatever --memory and --overlap say.
-"""
-    examples: ClassVar = """\
-  All files of a folder; if interrupted, go on with --resume:
-    kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o sharp --resume
-
-  A better picture, in seven times the time:
-    kornia-tidy raw reconstruct shots/*.dng --head edof-5 -o best --orientations 8
-
-  A camera of your own design, and one that was measured, without training:
-    kornia-tidy raw reconstruct shots/*.dng --head camera.safetensors -o sharp
-    kornia-tidy raw reconstruct shots/*.dng --psfs bank.safetensors --noise iso800.json -o sharp
-
-  The same camera by its masks and its real lens, whose PSFs vary over the picture:
-    kornia-tidy raw reconstruct shots/*.dng --masks heights.npy --lens single-50mm \\
-        --f-number 12 --focus-distance 0.7 --noise iso800.json -o sharp
-
-  A network of one's own:
-    kornia-tidy raw reconstruct shots/*.dng --head run/best.safetensors -o depths
-"""
 
     def run(self) -> None:
         """Reconstruct captures."""

@@ -51,7 +51,7 @@ class SensorOptions(SensorInElectrons):
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateRaw:
-    """Make a raw file from a picture and its depth.
+    r"""Make a raw file from a picture and its depth.
 
     The scene is a picture with a depth map of the same size. It is blurred by the lens with
     its K phase masks, sampled through the filter array, and recorded with the camera's
@@ -74,6 +74,24 @@ class SimulateRaw:
         sensor: that records the light.
         optics: lens and masks.
         file: how the depth is stored.
+
+    Notes:
+        The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
+
+    Examples:
+        For one's own camera: filter array, levels and colours of one of its files, and its
+        noise from 'kornia-tidy raw calibrate-noise':
+          kornia-tidy raw simulate --image rgb.png --depth depth.png --depth-scale 0.001 \
+              --like shot.cr2 --noise iso800.json -o coded.dng
+
+        A 14-bit sensor that is given in words:
+          kornia-tidy raw simulate --image rgb.png --depth depth.pfm --pattern GBRG \
+              --bits 14 --full-well 30000 --read-noise 3 -o coded.dng
+
+        A dark capture, a flat, and 24 points at half a metre, to try out a calibration:
+          kornia-tidy raw simulate --flat 0 -o dark.dng
+          kornia-tidy raw simulate --flat 0.5 -o flat.dng
+          kornia-tidy raw simulate --points 24 --distance 0.5 --size 1008x672 -o point0.5.dng
     """
 
     output: Annotated[str, Unit("OUT.dng")]
@@ -93,24 +111,6 @@ class SimulateRaw:
         *("output", "image", "depth", "depth_scale", "flat", "points", "distance", "size", "like", "pattern", "bits"),
         *("full_well", "read_noise", "noise", "seed", "masks", "psfs", "depth_range", "f_number", "fit_depth"),
     )
-    examples: ClassVar = """\
-  For one's own camera: filter array, levels and colours of one of its files, and its
-  noise from 'kornia-tidy raw calibrate-noise':
-    kornia-tidy raw simulate --image rgb.png --depth depth.png --depth-scale 0.001 \\
-        --like shot.cr2 --noise iso800.json -o coded.dng
-
-  A 14-bit sensor that is given in words:
-    kornia-tidy raw simulate --image rgb.png --depth depth.pfm --pattern GBRG \\
-        --bits 14 --full-well 30000 --read-noise 3 -o coded.dng
-
-  A dark capture, a flat, and 24 points at half a metre, to try out a calibration:
-    kornia-tidy raw simulate --flat 0 -o dark.dng
-    kornia-tidy raw simulate --flat 0.5 -o flat.dng
-    kornia-tidy raw simulate --points 24 --distance 0.5 --size 1008x672 -o point0.5.dng
-"""
-    notes: ClassVar = """\
-The picture in Python: kornia_tidy.lab.raw.simulation.simulate_scene.
-"""
 
     def __post_init__(self) -> None:
         if sum(target is not None for target in (self.image, self.flat, self.points)) != 1:

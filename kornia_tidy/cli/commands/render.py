@@ -48,7 +48,7 @@ class Files:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Photograph a data set and store its coded captures.
+    r"""Photograph a data set and store its coded captures.
 
     Every scene of a data set is photographed once through a camera with phase masks, and
     the captures are stored for training. The camera is given by the options below, a
@@ -78,6 +78,32 @@ class Render:
             calibrate-noise wrote. None: 0.01.
         files: of the captures.
         settings: of camera and scenes.
+
+    Notes:
+        After an interruption the same command continues and gives the same bytes, since captures
+        and shards are written atomically. Camera, scene, seed and number determine a capture, for
+        any --jobs and any process (on processors of one kind). Processes of torchrun or srun, or
+        others with RANK and WORLD_SIZE in their environment, share the work, on one machine or on
+        several that share FOLDER. A process that finishes its share renders missing captures of
+        others, so that nothing is lost with a process.
+
+        In Python, in a data loader:
+          from kornia_tidy.training.coded_datasets.captures import CodedCaptures
+          CodedCaptures("captures")[0]        # {"coded", "image", "depth", "mask", "index", "name"}
+
+    Examples:
+        Scenes made here, through five random masks, on all of 8 cores:
+          kornia-tidy render --scenes 1000 --jobs 8 -o captures
+
+        The scenes that a training was not shown, through the masks it learnt, in shards:
+          kornia-tidy render --checkpoint outputs/edof/best.safetensors --split test \
+              --shard-megabytes 500 -o captures
+
+        Two machines with 16 processes each:
+          torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy render ... -o captures
+
+        The same by SLURM:
+          srun --nodes 2 --ntasks-per-node 16 kornia-tidy render ... -o captures
     """
 
     output: Folder
@@ -102,32 +128,6 @@ class Render:
         *("output", "jobs", "noise_seed", "split", "scenes", "preset", "checkpoint", "noise", "masks", "depth_range"),
         *("f_number", "fidelity", "data", "root", "size", "seed", "float32", "shard_items", "shard_megabytes"),
     )
-    notes: ClassVar = """\
-After an interruption the same command continues and gives the same bytes, since captures
-and shards are written atomically. Camera, scene, seed and number determine a capture, for
-any --jobs and any process (on processors of one kind). Processes of torchrun or srun, or
-others with RANK and WORLD_SIZE in their environment, share the work, on one machine or on
-several that share FOLDER. A process that finishes its share renders missing captures of
-others, so that nothing is lost with a process.
-
-In Python, in a data loader:
-  from kornia_tidy.training.coded_datasets.captures import CodedCaptures
-  CodedCaptures("captures")[0]        # {"coded", "image", "depth", "mask", "index", "name"}
-"""
-    examples: ClassVar = """\
-  Scenes made here, through five random masks, on all of 8 cores:
-    kornia-tidy render --scenes 1000 --jobs 8 -o captures
-
-  The scenes that a training was not shown, through the masks it learnt, in shards:
-    kornia-tidy render --checkpoint outputs/edof/best.safetensors --split test \\
-        --shard-megabytes 500 -o captures
-
-  Two machines with 16 processes each:
-    torchrun --nnodes 2 --nproc-per-node 16 ... -m kornia_tidy render ... -o captures
-
-  The same by SLURM:
-    srun --nodes 2 --ntasks-per-node 16 kornia-tidy render ... -o captures
-"""
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.checkpoint is not None:

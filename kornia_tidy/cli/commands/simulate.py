@@ -14,7 +14,7 @@ from kornia_tidy.settings import Seed, Unit, one_of
 
 @dataclass(frozen=True, kw_only=True)
 class Simulate:
-    """Make the coded capture of a picture and its depth.
+    r"""Make the coded capture of a picture and its depth.
 
     The camera shows its K phase masks one after another during one exposure. The scene is
     a picture and a depth map of the same size. Masks of random height have 23 x 23 pixels:
@@ -37,6 +37,29 @@ class Simulate:
             light, as the paper does. None: srgb, or paper with that fidelity.
         file: how the depth is stored.
         camera: lens and masks.
+
+    Notes:
+        The first example in Python, the same but for the rounding to 8 bits:
+          import torch
+          from kornia_tidy import PixelwiseMask, TiDyOptics
+          from kornia_tidy.data.rgbd import read_rgbd
+          image, depth, valid = read_rgbd("rgb.png", "depth.png", scale=0.001)
+          optics = TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
+          coded = optics(image, depth, generator=torch.Generator().manual_seed(0))
+
+    Examples:
+        A Kinect frame, depth in millimetres:
+          kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --holes fill \
+              -o coded.png
+
+        A Middlebury stereo scene, with a lens chosen for its depths:
+          kornia-tidy simulate im0.png --depth disp0.pfm --depth-kind disparity \
+              --invalid inf --focal-px 999.421 --baseline-m 0.193001 --doffs-px 32.778 \
+              --holes fill --fit-depth
+
+        Through a real lens, from a file of an optical program:
+          kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --lens lens.zmx \
+              --f-number 8 --focus-distance 1.5
     """
 
     image: Annotated[str, Argument("IMAGE")]
@@ -53,29 +76,6 @@ class Simulate:
     camera: CameraSettings = field(default_factory=CameraSettings)
     file: DepthFile = field(default_factory=DepthFile)
 
-    examples: ClassVar = """\
-  A Kinect frame, depth in millimetres:
-    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --holes fill \\
-        -o coded.png
-
-  A Middlebury stereo scene, with a lens chosen for its depths:
-    kornia-tidy simulate im0.png --depth disp0.pfm --depth-kind disparity \\
-        --invalid inf --focal-px 999.421 --baseline-m 0.193001 --doffs-px 32.778 \\
-        --holes fill --fit-depth
-
-  Through a real lens, from a file of an optical program:
-    kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --lens lens.zmx \\
-        --f-number 8 --focus-distance 1.5
-"""
-    notes: ClassVar = """\
-The first example in Python, the same but for the rounding to 8 bits:
-  import torch
-  from kornia_tidy import PixelwiseMask, TiDyOptics
-  from kornia_tidy.data.rgbd import read_rgbd
-  image, depth, valid = read_rgbd("rgb.png", "depth.png", scale=0.001)
-  optics = TiDyOptics(PixelwiseMask(5, generator=torch.Generator().manual_seed(0)))
-  coded = optics(image, depth, generator=torch.Generator().manual_seed(0))
-"""
     basic: ClassVar = (
         *(
             "image",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import SYSTEMS
 from kornia_tidy.cli.commands.parser import Parsed
@@ -52,6 +52,11 @@ class Systems:
         size: longer side of the scene: larger ones are made smaller, and blur then looks larger.
         seed: of scene, masks and noise.
         scene: to be captured.
+
+    Examples:
+        kornia-tidy systems                                    all nine, on a scene made here
+        kornia-tidy systems --systems tidy-5,ikoma2021 -o two.png
+        kornia-tidy systems --image rgb.png --depth depth.png --depth-scale 0.001
     """
 
     systems: Annotated[tuple, Parsed("A,B", read=names_of)] | None = None
@@ -59,12 +64,6 @@ class Systems:
     size: Annotated[int, Unit("PX", "pixels", 32)] = 320
     seed: Seed = 0
     scene: OwnScene = field(default_factory=OwnScene)
-
-    examples: ClassVar = """\
-  kornia-tidy systems                                    all nine, on a scene made here
-  kornia-tidy systems --systems tidy-5,ikoma2021 -o two.png
-  kornia-tidy systems --image rgb.png --depth depth.png --depth-scale 0.001
-"""
 
     def run(self) -> None:
         """List the systems, compute their statistics, and draw them."""

@@ -41,6 +41,23 @@ class Trade:
         device: cpu, cuda or cuda:N.
         scene: that is captured.
         camera: lens and masks.
+
+    Notes:
+        Results are written to FOLDER/trade.json after every point, and at the end a figure to
+        trade.png and a table to the screen.
+
+        No setting can lower the error below that of the other settings. With an exact but slow
+        base, --base reference, the error of each single setting is measured.
+
+        Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
+        environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
+
+    Examples:
+        kornia-tidy trade                                 all settings, on a generated scene
+
+        kornia-tidy trade --knobs window layers --training
+
+        kornia-tidy trade --image rgb.png --depth depth.png --depth-scale 0.001 --device cuda
     """
 
     output: Folder = "outputs/trade"
@@ -59,23 +76,6 @@ class Trade:
         *("output", "size", "seed", "knobs", "base", "reference", "training", "repeats", "device", "image", "depth"),
         *("depth_scale", "masks", "depth_range", "f_number", "focus_distance", "fit_depth"),
     )
-    notes: ClassVar = """\
-Results are written to FOLDER/trade.json after every point, and at the end a figure to
-trade.png and a table to the screen.
-
-No setting can lower the error below that of the other settings. With an exact but slow
-base, --base reference, the error of each single setting is measured.
-
-Times are reliable on an otherwise idle machine. PyTorch uses as many threads as the
-environment variable OMP_NUM_THREADS says; on a busy machine fewer can be much faster.
-"""
-    examples: ClassVar = """\
-  kornia-tidy trade                                 all settings, on a generated scene
-
-  kornia-tidy trade --knobs window layers --training
-
-  kornia-tidy trade --image rgb.png --depth depth.png --depth-scale 0.001 --device cuda
-"""
 
     def run(self) -> None:
         """Measure the sweep, write files after every row, and print the table."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import textwrap
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from kornia_tidy.cli.commands.parser import Given
 from kornia_tidy.cli.commands.shared import OF_SENSOR, File, Folder, Noise, measured_system, refuse_with_psfs
 from kornia_tidy.settings import Count, Processes, Unit, one_of
-from kornia_tidy.training.settings import LEARN, NETWORK_RUN, TrainingSettings, usual_settings
+from kornia_tidy.training.settings import LEARN, TrainingSettings, usual_settings
 
 if TYPE_CHECKING:
     from kornia_tidy.psf.field_bank import FieldBank
@@ -41,7 +40,7 @@ class Machine:
 
 @dataclass(frozen=True, kw_only=True)
 class Train:
-    """Learn masks and network together.
+    r"""Learn masks and network together.
 
     The network reads the captures of the masks' camera. It gives an image in focus
     everywhere (edof), a depth map (depth), or both (joint). With --learn network it
@@ -61,6 +60,63 @@ class Train:
             computed for lens and masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: 0.01.
+
+    Notes:
+        FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
+        the best epoch), training.csv, validation.csv, learning_curve.png, which tells at which
+        step the score levels off (with matplotlib), pictures of masks, PSFs and estimates in
+        pictures/, and a log for `tensorboard --logdir FOLDER`. After Ctrl-C or a power failure
+        --resume continues with the stored settings, and ends with the same weights as an
+        uninterrupted run (to the bit on one CPU process).
+
+        Defaults of --learn network, which are for a CPU:
+          --head nafnet --closed-form --width 16 --size 256 --scenes 1000 --validation-scenes 24
+          --batch 4 --lr 0.002 --schedule cosine --loss charbonnier --epochs 24
+
+    Examples:
+        The paper's extended depth of field, on scenes made here:
+          kornia-tidy train --task edof --masks 5 --pretrain-epochs 300 -o outputs/edof
+
+        A first look, in minutes on a CPU, for which the paper's network is too large:
+          kornia-tidy train --task depth --head plain --size 96 --scenes 64 --batch 4 --epochs 5 \
+            -o outputs/look
+
+        Extended depth of field in minutes on a CPU, from masks that are designed first:
+          kornia-tidy train --task edof --start "focal sweep" --design 120 --refocus 5 --width 8 \
+            --residual --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 \
+            -o outputs/swept
+
+        A network behind five designed masks, in hours on a CPU; then both together:
+          kornia-tidy train --learn network --start "focal sweep" --design 120 -o outputs/network
+          kornia-tidy train --learn both --start "focal sweep" --design 120 --head nafnet --width 16 \
+            --closed-form --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 \
+            -o outputs/both
+
+        Masks again, for a network that has learnt, at a rate for masks that are good already:
+          kornia-tidy train --learn masks --start "focal sweep" --lr-metres 4e-9 --batch 2 --epochs 2 \
+            --masks-from outputs/network/best.safetensors --head-from outputs/network/best.safetensors \
+            -o outputs/masks
+
+        A network for the camera that `kornia-tidy design` recommends, and one for a lens without
+        masks at f/48, both for 500 to 57,000 electrons of white at f/17.6 in the same time:
+          kornia-tidy train --learn network --design-from outputs/design --electrons 500 57000 \
+            -o outputs/designed
+          kornia-tidy train --learn network --masks 1 --start flat --f-number 48 --focus-distance 0.74 \
+            --electrons 500 57000 -o outputs/flat
+
+        A network for a camera that was measured:
+          kornia-tidy train --learn network --psfs bank.safetensors --noise iso800.json -o outputs/mine
+
+        Depth with its uncertainty, and the image, in some minutes on a CPU:
+          kornia-tidy train --task joint --start "like fishers" --depth-classes 32 --refocus 11 --width 8 \
+            --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 -o outputs/uncertain
+
+        The paper's patches, by the loss of PhaseCam3D:
+          kornia-tidy train --task depth --data flying-things-patches --root FlyingThings3D \
+            --loss phasecam3d --border valid -o outputs/depth
+
+        Goes on after an interruption; a longer run may be asked for:
+          kornia-tidy train --resume --epochs 400 -o outputs/edof
     """
 
     output: Folder = "outputs/train"
@@ -79,66 +135,6 @@ class Train:
         *("output", "resume", "task", "learn", "masks", "start", "head", "width", "data", "root", "size"),
         *("scenes", "depth_range", "f_number", "noise", "epochs", "batch", "lr", "seed", "accelerator"),
     )
-    notes: ClassVar = """\
-FOLDER gets settings.json, last.safetensors (to go on from), best.safetensors (weights of
-the best epoch), training.csv, validation.csv, learning_curve.png, which tells at which
-step the score levels off (with matplotlib), pictures of masks, PSFs and estimates in
-pictures/, and a log for `tensorboard --logdir FOLDER`. After Ctrl-C or a power failure
---resume continues with the stored settings, and ends with the same weights as an
-uninterrupted run (to the bit on one CPU process).
-
-Defaults of --learn network, which are for a CPU:
-""" + textwrap.fill(
-        " ".join(
-            f"--{name.replace('_', '-')}" + ("" if value is True else f" {value}")
-            for name, value in NETWORK_RUN.items() if name != "learn" and value is not None
-        ),
-        88, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False,
-    )  # fmt: skip
-    examples: ClassVar = """\
-  The paper's extended depth of field, on scenes made here:
-    kornia-tidy train --task edof --masks 5 --pretrain-epochs 300 -o outputs/edof
-
-  A first look, in minutes on a CPU, for which the paper's network is too large:
-    kornia-tidy train --task depth --head plain --size 96 --scenes 64 --batch 4 --epochs 5 \\
-      -o outputs/look
-
-  Extended depth of field in minutes on a CPU, from masks that are designed first:
-    kornia-tidy train --task edof --start "focal sweep" --design 120 --refocus 5 --width 8 \\
-      --residual --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 \\
-      -o outputs/swept
-
-  A network behind five designed masks, in hours on a CPU; then both together:
-    kornia-tidy train --learn network --start "focal sweep" --design 120 -o outputs/network
-    kornia-tidy train --learn both --start "focal sweep" --design 120 --head nafnet --width 16 \\
-      --closed-form --head-from outputs/network/best.safetensors --lr 2e-4 --size 128 --batch 4 \\
-      -o outputs/both
-
-  Masks again, for a network that has learnt, at a rate for masks that are good already:
-    kornia-tidy train --learn masks --start "focal sweep" --lr-metres 4e-9 --batch 2 --epochs 2 \\
-      --masks-from outputs/network/best.safetensors --head-from outputs/network/best.safetensors \\
-      -o outputs/masks
-
-  A network for the camera that `kornia-tidy design` recommends, and one for a lens without
-  masks at f/48, both for 500 to 57,000 electrons of white at f/17.6 in the same time:
-    kornia-tidy train --learn network --design-from outputs/design --electrons 500 57000 \\
-      -o outputs/designed
-    kornia-tidy train --learn network --masks 1 --start flat --f-number 48 --focus-distance 0.74 \\
-      --electrons 500 57000 -o outputs/flat
-
-  A network for a camera that was measured:
-    kornia-tidy train --learn network --psfs bank.safetensors --noise iso800.json -o outputs/mine
-
-  Depth with its uncertainty, and the image, in some minutes on a CPU:
-    kornia-tidy train --task joint --start "like fishers" --depth-classes 32 --refocus 11 --width 8 \\
-      --size 128 --scenes 480 --batch 6 --lr 2e-3 --lr-metres 6e-8 --epochs 10 -o outputs/uncertain
-
-  The paper's patches, by the loss of PhaseCam3D:
-    kornia-tidy train --task depth --data flying-things-patches --root FlyingThings3D \\
-      --loss phasecam3d --border valid -o outputs/depth
-
-  Goes on after an interruption; a longer run may be asked for:
-    kornia-tidy train --resume --epochs 400 -o outputs/edof"""
 
     def run(self) -> None:
         """Train or resume a run, and print its results."""

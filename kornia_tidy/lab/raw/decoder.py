@@ -18,7 +18,6 @@ from typing import Any
 LARGEST_TILE = 6  # X-Trans
 LOADED = "loaded"  # printed once NumPy and LibRaw are imported: an earlier crash is not caused by the file
 PACKAGE = "kornia_tidy_raw"  # name of this folder in the decoder process
-C330_LENGTHS = (2247168, 3370752)  # bytes; LibRaw recognises the headerless files of a Kodak C330 by their length
 
 
 def main() -> None:
@@ -93,8 +92,6 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         counts = _described_by_libraw(header, counts, raw)
     counts = np.ascontiguousarray(counts)
     header |= {"shape": counts.shape if counts.ndim == 3 else (*counts.shape, 1), "type": counts.dtype.name}
-    if counts.ndim == 3 and len(data) in C330_LENGTHS and not any(directories):
-        header |= finished_colors()
     return header, counts.data.cast("B")
 
 
@@ -110,16 +107,6 @@ def _described_by_libraw(header: dict[str, Any], counts: Any, raw: Any) -> Any:
         black = [[levels[c] for c in row] for row in pattern]
     header |= {"pattern": pattern, "colors": colors, "black": black, "white": raw.white_level}
     return counts if counts.ndim == 2 else counts[..., :channels]
-
-
-def finished_colors() -> dict[str, Any]:
-    """Return header fields of a Kodak C330 file; its YCbCr data are white-balanced sRGB."""
-    return {
-        "camera_to_srgb": [[float(row == column) for column in range(4)] for row in range(3)],
-        "white_balance": [1.0] * 4,
-        "daylight_balance": [1.0] * 4,
-        "info": {"make": "Kodak", "model": "C330"},
-    }
 
 
 def filter_pattern(raw: Any) -> list[list[int]]:

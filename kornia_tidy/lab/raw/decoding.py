@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-import warnings
 from collections.abc import Generator
 from contextlib import contextmanager
 from io import SEEK_END
@@ -21,8 +20,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_positive
 from kornia_tidy.files import check_file, parse_json
-from kornia_tidy.lab.raw.decoder import C330_LENGTHS, LOADED
-from kornia_tidy.lab.raw.validation import is_c330
+from kornia_tidy.lab.raw.decoder import LOADED
 from kornia_tidy.search_path import ROOT, package_folders
 
 Source = str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryIO
@@ -71,9 +69,6 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
     Raises:
         FileNotFoundError: if the file is missing.
         ValueError: if the file cannot be decoded within these limits.
-
-    Warns:
-        UserWarning: if a file without a header is recognised by its length.
     """
     check_positive("timeout", timeout, "seconds")
     check_positive("memory_limit", memory_limit, "bytes")
@@ -81,14 +76,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
     with _opened(source) as file, TemporaryFile() as result:
         length = file.seek(0, SEEK_END)
         file.seek(0)
-        beginning = file.read(16)
-        if length in C330_LENGTHS and not begins_as_raw(beginning) and is_c330(beginning + file.read()):
-            warnings.warn(
-                f"{name} has no header: by its length of {length} bytes it is taken for a picture of a Kodak C330",
-                stacklevel=3,
-            )
-        else:
-            check_beginning(name, beginning)
+        check_beginning(name, file.read(16))
         file.seek(0)  # the process reads from the current position
         try:
             complaint = _complaint(*_run(file, result, timeout, memory_limit), memory_limit)
@@ -132,7 +120,7 @@ def check_beginning(name: str, data: bytes) -> None:
     """Raise ``ValueError`` unless the first bytes are those of a raw file, before LibRaw guesses from the size."""
     if not data:
         raise ValueError(f"cannot read {name}: the file is empty")
-    if begins_as_raw(data):
+    if any(data.startswith(beginning, place) for place, all_ in BEGINNINGS.items() for beginning in all_):
         return
     if data.startswith((b"\xff\xd8\xff", b"\x89PNG")):
         raise ValueError(f"cannot read {name}: it is a JPEG or PNG picture, not a raw file")
@@ -140,11 +128,6 @@ def check_beginning(name: str, data: bytes) -> None:
         f"cannot read {name}: it does not begin as raw files do; if it is a bare dump of the counts, give its size, "
         "data type, filter pattern, black and white levels"
     )
-
-
-def begins_as_raw(data: bytes) -> bool:
-    """Return whether a file starts with the header of a known raw format."""
-    return any(data.startswith(beginning, place) for place, all_ in BEGINNINGS.items() for beginning in all_)
 
 
 @contextmanager

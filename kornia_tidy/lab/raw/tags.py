@@ -2,9 +2,9 @@
 
 LibRaw's Python package does not return the manufacturer and the colour matrix of Kodak's first cameras. The tags of a
 damaged file may hold any value. The decoder process runs this file, so it imports only the standard library. ExifRead
-and tifffile are not used: of 51 raw files tried they read nothing from 12, which are CRW, CR3, RAF and QuickTake files.
+and tifffile are not used: of 51 raw files tried they read nothing from 12, such as CR3 and RAF files.
 
-Source: TIFF 6.0, section 2; Exif 2.32, 4.6; P. Harvey's notes on Canon's CRW format; dcraw for Kodak's matrix.
+Source: TIFF 6.0, section 2; Exif 2.32, 4.6; dcraw for Kodak's matrix.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ STRIPS, TILES, TILE_SIZE = (0x0111, 0x0117), (0x0144, 0x0145), (0x0142, 0x0143) 
 FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT = 0x828D, 0x828E, 0xC616, 0xC617
 DNG_VERSION, LINEARIZATION, BLACK_REPEAT, BLACK_LEVEL, BLACK_COLUMNS, BLACK_ROWS = 0xC612, *range(0xC618, 0xC61D)
 WHITE_LEVEL, NEUTRAL, ACTIVE_AREA, OPCODE_LISTS = 0xC61D, 0xC628, 0xC68D, (0xC740, 0xC741, 0xC74E)
-QUICKTAKE = {b"qktk": "QuickTake 100", b"qktn": "QuickTake 150"}
-CIFF_NAMES, CIFF_HEAPS = 0x080A, (0x28, 0x30)
 
 # Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
@@ -86,10 +84,6 @@ def camera_tags(data: bytes) -> dict[str, Any]:
         found["focal_length"] *= 1e-3
     found["timestamp"] = next((t for values in _values(directories, TIMES) if (t := _time(_text(values)))), None)
     found["noise_profile"] = next((p for v in _values(directories, (NOISE_PROFILE,)) if (p := _noise_profile(v))), None)
-    if data[6:14] == b"HEAPCCDR":
-        found["make"], found["model"] = _ciff_names(data)
-    if data[:4] in QUICKTAKE:
-        found["make"], found["model"] = "Apple", QUICKTAKE[data[:4]]
     return {name: value for name, value in found.items() if value is not None}
 
 
@@ -200,23 +194,3 @@ def _time(text: str | None) -> str | None:
         return datetime.strptime(text or "", "%Y:%m:%d %H:%M:%S").isoformat()  # by the camera's clock
     except ValueError:
         return None
-
-
-def _ciff_names(data: bytes) -> tuple[str | None, str | None]:
-    """Return make and model from the heaps of Canon's CRW, which end with the offsets of their record lists."""
-    waiting = [((_unpack(data, "<I", 2) or (0,))[0], len(data))]
-    for _ in range(MOST_DIRECTORIES):
-        if not waiting:
-            break
-        start, end = waiting.pop(0)
-        table = start + (_unpack(data, "<I", end - 4) or (0,))[0]
-        count = min((_unpack(data, "<H", table) or (0,))[0], MOST_ENTRIES)
-        for entry in range(table + 2, table + 2 + 10 * count, 10):
-            kind, size, offset = _unpack(data, "<HII", entry) or (0, 0, 0)
-            if kind == CIFF_NAMES:
-                names = data[start + offset : start + offset + min(size, MOST_BYTES)]
-                make, model = [*names.split(b"\0"), b"", b""][:2]
-                return _text((make,)), _text((model,))
-            if kind >> 8 in CIFF_HEAPS:
-                waiting.append((start + offset, start + offset + size))
-    return None, None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import warnings
 
-import numpy as np
 from torch import Tensor
 
 LEAST_BITS = 0.05  # per pixel; lossy compression of an empty picture takes twice as many
@@ -15,22 +14,6 @@ MOST_ABOVE_WHITE = 1e-3  # share of the counts; hot pixels may lie above white
 # (share, factor): a white level is rejected if more than this share of the counts is above this multiple of it. Noise
 # and channels with different saturation levels stay within 10 % of white, and hot pixels are rare.
 WHITE_LIMITS = ((1e-2, 1.1), (1e-3, 1.5))
-C330_ROWS, C330_ROW = 912, 2464  # bytes: Y Cb Y Cr ...
-C330_BLOCK, C330_GAP = 32, 16  # rows, in the longer files
-MOST_LUMA_STEP, MOST_CHROMA_STEP = 32, 16  # mean difference of adjacent samples; text and noise have more
-GREY, MOST_COLOR = 128, 64  # neutral chroma, and the largest mean deviation of a picture from it
-
-
-def is_c330(data: bytes) -> bool:
-    """Return whether bytes (whole rows) look like the headerless 4:2:2 YCbCr data of a Kodak C330."""
-    rows = np.frombuffer(data, np.uint8).reshape(-1, C330_ROW).astype(np.int16)
-    if len(rows) > C330_ROWS:
-        rows = rows[np.arange(len(rows)) % (C330_BLOCK + C330_GAP) < C330_BLOCK]
-    luma, blue, red = rows[:C330_ROWS, ::2], rows[:C330_ROWS, 1::4], rows[:C330_ROWS, 3::4]
-    return all(
-        np.abs(np.diff(plane)).mean() < most
-        for plane, most in ((luma, MOST_LUMA_STEP), (blue, MOST_CHROMA_STEP), (red, MOST_CHROMA_STEP))
-    ) and all(abs(plane.mean() - GREY) < MOST_COLOR for plane in (blue, red))
 
 
 def check_counts(name: str, counts: Tensor, black: Tensor, white: float, length: int) -> None:

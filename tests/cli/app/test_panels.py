@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.cli.app import pictures
 from kornia_tidy.cli.app.answers import draw
 from kornia_tidy.cli.app.capture import own_camera, take_picture
 from kornia_tidy.cli.app.legends import legends
-from kornia_tidy.cli.app.pictures import CELL, COLUMNS, GAP, HEAD, LEFT, MASK_SPACE, TITLE, mask_colors, psf_cell
 from kornia_tidy.cli.app.scenes import read_files
 from kornia_tidy.cli.app.script import as_python
 from kornia_tidy.cli.app.settings import Settings
 from kornia_tidy.data import write_image
-from kornia_tidy.figures.style import PHASE_COLORS
 from kornia_tidy.reconstruction.tasks import stretched
 from tests.base import BaseTester
 
@@ -30,70 +27,6 @@ SMALL = {"side": 96}
 def result():
     """Three random masks, whose PSFs have no symmetry, over a range of defocus without symmetry."""
     return take_picture(Settings(camera="own", start="noise", masks=3, near=0.4, far=2.0, **SMALL))
-
-
-@pytest.fixture(scope="module")
-def panel(result):
-    return pictures.masks_and_psfs(result)
-
-
-def cell(panel, row, column):
-    """Return a cell of the panel in [0, 1]; column -1 holds the masks."""
-    y = TITLE + HEAD + row * (CELL + GAP)
-    x = LEFT if column < 0 else LEFT + CELL + MASK_SPACE + column * (CELL + GAP)
-    return panel[y : y + CELL, x : x + CELL] / 255
-
-
-class TestMasksAndPSFs(BaseTester):
-    @pytest.mark.parametrize("column", range(COLUMNS))
-    def test_feature_each_column_is_one_depth_from_near_to_far(self, result, panel, column):
-        """The PSFs of each mask alone, and of all of them in the last row; drawn in 255 steps."""
-        lo, hi = result.camera.defocus_range
-        psi = [hi + (lo - hi) * column / (COLUMNS - 1)]
-        with torch.no_grad():
-            alone = [result.optics.through_state(k).psf_bank(defocus=psi).psfs[0] for k in range(3)]
-            average = result.optics.psf_bank(defocus=psi).psfs[0]
-        for row, psf in enumerate([*alone, average]):
-            assert np.abs(cell(panel, row, column) - psf_cell(psf)).max() < 1.5 / 255
-
-    def test_feature_each_row_begins_with_its_mask(self, result, panel):
-        for row, mask in enumerate(mask_colors(result.optics)):
-            assert np.abs(cell(panel, row, -1) - mask).max() < 1.5 / 255
-
-    def test_feature_depths_and_signs_of_defocus_stand_above_their_columns(self, result, monkeypatch):
-        """The defocus of a thin lens, pi R^2 / 530 nm (1/z - 1/0.595 m), of the depths as they are written."""
-        monkeypatch.setattr(pictures, "_pixels", lambda figure: figure)
-        texts = sorted(
-            (text.get_position()[0], text.get_text()) for text in pictures.masks_and_psfs(result).axes[0].texts
-        )
-        depths = [float(words.removesuffix(" m")) for _, words in texts if words.endswith(" m")]
-        psi = [float(words[4:].replace("\N{MINUS SIGN}", "-")) for _, words in texts if words.startswith("ψ = ")]
-        assert len(depths) == len(psi) == COLUMNS
-        assert depths == sorted(depths)
-        radius = 0.05 / 17.6 / 2
-        for depth, defocus in zip(depths, psi, strict=True):
-            expected = np.pi * radius**2 / 530e-9 * (1 / depth - 1 / 0.595)
-            rounded = 0.5 + np.pi * radius**2 / 530e-9 * 0.005 / depth  # three digits of the depth, whole radians
-            assert abs(defocus - expected) <= rounded
-
-    def test_convention_a_psf_is_drawn_as_it_lies_on_the_sensor(self):
-        psf = torch.zeros(3, 2, 2)
-        psf[0, 0, 1], psf[2, 1, 0] = 1.0, 1.0
-        drawn = psf_cell(psf)
-        assert drawn[0, -1].tolist() == [1, 0, 0]
-        assert drawn[-1, 0].tolist() == [0, 0, 1]
-
-    def test_convention_a_mask_is_drawn_as_it_lies_in_the_pupil(self):
-        """Half a wave in one pixel: the middle of the colours there, their beginning elsewhere, a wave added or not."""
-        optics = take_picture(Settings(camera="own", start="flat", **SMALL)).optics
-        optics.masks.phase.data[0, 9, 15] += 3 * np.pi
-        optics.masks.phase.data[0, 13, 6] += 2 * np.pi
-        (mask,) = mask_colors(optics)
-        pixels = mask[np.ix_(*[((np.arange(23) + 0.5) * CELL / 23).astype(int)] * 2)]
-        colors = matplotlib.colormaps[PHASE_COLORS]
-        assert pixels[9, 15] == pytest.approx(colors(0.5)[:3], abs=0.02)
-        assert pixels[15, 9] == pytest.approx(colors(0.0)[:3], abs=0.02)
-        assert min(abs(pixels[13, 6] - colors(end)[:3]).max() for end in (0.0, 1.0)) < 0.02
 
 
 class TestDraw(BaseTester):

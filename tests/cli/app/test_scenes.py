@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.cli.app.scenes import chart, read_files
+from kornia_tidy.cli.app.scenes import read_files
 from kornia_tidy.data import write_image
 from tests.base import BaseTester
 
@@ -21,19 +19,6 @@ def files(tmp_path):
     write_image(tmp_path / "photo.png", image)
     np.save(tmp_path / "depth.npy", depth)
     return tmp_path
-
-
-class TestChart(BaseTester):
-    def test_feature_five_strips_evenly_spaced_in_inverse_depth(self):
-        image, depth = chart(75, 100, (0.5, math.inf))
-        assert image.shape == (3, 75, 100)
-        self.assert_close(1 / depth[0, 0, ::20], torch.tensor([2.0, 1.5, 1.0, 0.5, 0.0]))
-        assert bool((depth == depth[:, :1]).all())
-
-    def test_feature_strips_differ_in_depth_and_tint_alone(self):
-        image, _ = chart(60, 150)
-        dark = (image[0] < 0.5).split(30, -1)
-        assert all(torch.equal(dark[0], other) for other in dark[1:])
 
 
 class TestReadFiles(BaseTester):

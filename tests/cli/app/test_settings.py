@@ -8,8 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.cli.app.controls import CONTROLS, by_name, settings_of, shown
-from kornia_tidy.cli.app.settings import Settings
+from kornia_tidy.cli.app.settings import CONTROLS, Settings, by_name, settings_of, shown
 from tests.base import BaseTester
 
 UNITS = ("(m)", "(mm)", "(µm)", "(% of full scale)", "(%)", "(pixels)")
@@ -24,17 +23,17 @@ class TestSettings(BaseTester):
     @pytest.mark.parametrize(
         ("values", "sentence"),
         [
-            ({"camera": "joint-9"}, "the camera must be one of"),
-            ({"scene": "lenna"}, "the scene must be one of"),
-            ({"compositing": "sum"}, "compositing must be one of"),
-            ({"noise": 0.6}, "the read noise must be from 0 to 50 % of full scale, got 60 %"),
-            ({"side": 5000}, "the longer side must be from 96 to 768 pixels, got 5000"),
-            ({"seed": -1}, "a seed must be a whole number"),
+            ({"camera": "joint-9"}, "Camera must be one of"),
+            ({"scene": "lenna"}, "Scene must be one of"),
+            ({"compositing": "sum"}, "Compositing at depth edges must be one of"),
+            ({"noise": 0.6}, "Read noise (% of full scale): give a number from 0 to 5, got 60"),
+            ({"side": 5000}, "Longer side of the picture (pixels): give a number from 96 to 768, got 5000"),
+            ({"seed": -1}, "Number of the painted scene: give a number from 0 to 2147483647, got -1"),
             ({"near": 4.0, "far": 2.0}, "the nearest depth must be positive and below the farthest, got 4 m and 2 m"),
             ({"scene": "files"}, "a photo is missing: upload both"),
-            ({"lens": "single"}, "the lens must be one of 'ideal', 'double-gauss-50mm'"),
-            ({"place": 1.5}, "the place in the field must be from 0 to 100 %, got 150 %"),
-            ({"camera": "own", "masks": 0}, "the number of masks K must be from 1 to 16, got 0"),
+            ({"lens": "single"}, "Lens must be one of 'ideal', 'double-gauss-50mm'"),
+            ({"place": 1.5}, "Place of the picture in a real lens's field (%): give a number from 0 to 100, got 150"),
+            ({"camera": "own", "masks": 0}, "Masks in one exposure, K: give a number from 1 to 16, got 0"),
             ({"camera": "own", "start": "focal sweep", "masks": 7}, "'focal sweep' are 5 at most, got K = 7"),
         ],
     )
@@ -105,9 +104,9 @@ class TestControls(BaseTester):
             ("own camera", "files", "own", True, True),
             ("painted depths", "dead leaves", "edof-5", True, False),
             ("painted depths", "dead leaves", "edof-5", False, True),
-            ("painted depths", "test chart", "own", True, True),
+            ("painted depths", "photographic leaves", "own", True, True),
             ("painted depths", "files", "own", True, False),
-            ("painted scene", "test chart", "own", True, False),
+            ("painted scene", "files", "own", True, False),
             ("files", "files", "edof-5", True, True),
             ("camera", "files", "own", False, True),
         ],

@@ -5,7 +5,6 @@ That the others are read is tested by ``test_registry.py``, with all examples.
 
 from __future__ import annotations
 
-import inspect
 import re
 import shlex
 import shutil
@@ -22,6 +21,7 @@ from kornia_tidy.data import dead_leaves, write_depth, write_image
 from kornia_tidy.lab.mask_export import write_heights
 from kornia_tidy.lab.raw.dng_file import write_dng
 from kornia_tidy.lab.raw.simulation import simulate_raw, simulated_sensor
+from kornia_tidy.settings import documented, section
 from kornia_tidy.training.coded_datasets import render_scenes
 from tests.base import BaseTester
 from tests.cli.commands.test_registry import ALL
@@ -32,7 +32,7 @@ NOT_HERE = ("disp0.pfm", "runs/", "lens.zmx", "quicktake/", "shot.cr2", "--field
 
 
 def said(command):
-    return f"{inspect.cleandoc(command.__doc__)}\n{getattr(command, 'notes', '')}"
+    return f"{documented(command)[1]}\n{section(command, 'Notes')}\n"
 
 
 def python_in(text):
@@ -43,7 +43,7 @@ def python_in(text):
 
 def commands_in(command):
     """Yield the words of the commands in the examples that can be run here."""
-    text = re.sub(r"\\\n\s*", "", getattr(command, "examples", ""))
+    text = re.sub(r"\\\n\s*", "", section(command, "Examples"))
     for line in text.splitlines():
         if line.strip().startswith("kornia-tidy ") and not any(name in line for name in NOT_HERE):
             yield re.split(r"   | [>|] ", line.strip(), maxsplit=1)[0]

@@ -63,6 +63,16 @@ class Tool:
         quick: at once.
         given: settings.
         lens: of it.
+
+    Notes:
+        Notes.
+
+    Examples:
+        one
+
+        two
+
+        three
     """
 
     files: Annotated[tuple[str, ...], Argument("FILES")]
@@ -77,8 +87,6 @@ class Tool:
     lens: Lens = field(default_factory=Lens)
 
     basic: ClassVar = ("files", "output", "kind", "focal_length")
-    notes: ClassVar = "Notes."
-    examples: ClassVar = "  one\n\n  two\n\n  three\n"
 
     def __post_init__(self) -> None:
         if self.quick and self.plot:

@@ -12,8 +12,12 @@ from dataclasses import MISSING
 
 import pytest
 
+from kornia_tidy.choices import PRETRAINED
 from kornia_tidy.cli.command_line import COMMANDS, _class, main, read_command
 from kornia_tidy.cli.commands.parser import Argument, _entries, make_parser
+from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
+from kornia_tidy.settings import section
+from kornia_tidy.training.settings import NETWORK_RUN
 from tests.base import BaseTester
 
 
@@ -108,7 +112,7 @@ class TestRegistry(BaseTester):
 
     @every_command
     def test_feature_examples_are_read(self, words):
-        text = re.sub(r"\\\n\s*", "", getattr(ALL[words], "examples", ""))
+        text = re.sub(r"\\\n\s*", "", section(ALL[words], "Examples"))
         commands = [line for line in text.splitlines() if line.lstrip().startswith("kornia-tidy ")]
         for line in commands:
             argv = shlex.split(re.split(r"   | [>|] ", line.strip(), maxsplit=1)[0])
@@ -117,11 +121,28 @@ class TestRegistry(BaseTester):
 
     @every_command
     def test_feature_python_in_the_notes_finds_its_imports(self, words):
-        text = getattr(ALL[words], "notes", "")
+        text = section(ALL[words], "Notes")
         for line in re.findall(r"^ *(from kornia_tidy.* import .*)$", text, re.MULTILINE):
             exec(line, {})
         for module, name in re.findall(r"\b(kornia_tidy(?:\.[a-z]\w*)+)\.(\w+)", re.sub("from .* import .*", "", text)):
             assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
+
+
+class TestNotes(BaseTester):
+    """What notes say of other settings is what these say."""
+
+    def test_feature_evaluate_names_every_system_that_comes_with_the_library(self):
+        shipped, closed = section(ALL["evaluate",], "Notes").splitlines()
+        assert shipped == f"Shipped systems: {', '.join(PRETRAINED)}."
+        assert closed == f"Closed forms: {', '.join(CLOSED_FORMS)}."
+
+    def test_feature_train_tells_the_defaults_of_a_network_behind_fixed_masks(self):
+        told = section(ALL["train",], "Notes").partition("for a CPU:\n")[2].split()
+        given = {name: value for name, value in NETWORK_RUN.items() if name != "learn" and value is not None}
+        words = (
+            (f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])) for name, value in given.items()
+        )
+        assert told == [word for pair in words for word in pair]
 
 
 def required(words, but):

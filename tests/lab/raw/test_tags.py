@@ -21,7 +21,6 @@ class TestCameraTags(BaseTester):
             ("CanonRaw.cr2", ("Canon EOS 350D DIGITAL", None, 400, 1 / 15, 8)),
             ("FujiFilm.raf", ("FinePix S5Pro", None, 100, 0.004, 8)),
             ("Nikon.nef", ("NIKON D70", None, 200, 0.05, 3.5)),
-            ("CanonRaw.crw", ("Canon EOS DIGITAL REBEL", None, None, None, None)),
         ],
     )
     def test_feature_of_cameras(self, name, expected):
