@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
+from kornia_tidy.reconstruction.clipped_light import CLIPPED, beyond_full_scale
 from kornia_tidy.reconstruction.closed_form import (
     LEAST_NOISE,
     SPACE,
@@ -31,7 +32,6 @@ from kornia_tidy.render.borders import next_fast_size, pad_border
 
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
-CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
 FINER = 2  # Wiener filters for less noise than those that a network is shown
 NOISES = tuple(WIENER_NOISES[0] * 10 ** (STEP * i) for i in range(-FINER, 0)) + WIENER_NOISES
 TIKHONOV = (3e-2, 1e-2, 3e-3, 1e-3)  # weights of the filters that follow, whose inverses of wide PSFs are cut less
@@ -85,6 +85,9 @@ class RuledClosedForm(ClosedForm):
 
     where n is noise drawn as the capture has it, restored and encoded as the capture is; the derivative is a
     difference. So texture beyond the noise is kept, and behind sharp optics in bright light c is 0.
+
+    Clipped pixels have the light that their neighbours let expect
+    (:func:`~kornia_tidy.reconstruction.clipped_light.beyond_full_scale`), so that the deconvolution rings less.
 
     The rule and its numbers were found on real scenes of half A behind the training cameras of
     ``tests/benchmarks/any_camera``. ``docs/record`` says how near it comes to the best choice behind each camera.
@@ -181,7 +184,7 @@ class RuledClosedForm(ClosedForm):
         return self._by(capture, self.settings(self._without_stray_light(self._light(capture)), noise))
 
     def _by(self, capture: Tensor, found: Settings) -> Restoration:
-        light = self._without_stray_light(self._light(capture))
+        light = self._without_stray_light(beyond_full_scale(self._light(capture), found.noise))
         restored = self._restored(capture, light, found.noise.expand_as(capture), found.place, found.color)
         return restored._replace(maps=torch.cat([restored.maps, self._camera_maps(capture, found.noise)], 1))
 

@@ -22,12 +22,15 @@ from kornia_tidy.masks import (
     ZernikeMask,
     initial_heights,
 )
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
-from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
+from kornia_tidy.reconstruction.trained import TrainedSystem, closed_form_bank, load_trained
 from kornia_tidy.seeds import keyed_seed
 
+ELEMENT = "single-50mm"
 WINDOW = 129  # px of the PSFs, as those of the shipped systems
 EARLIER = Path(__file__).parents[3] / "examples" / "paper" / "systems"  # that are no longer shipped
 SHIPPED = ("edof-1", "edof-5", "edof-designed", "edof-flat")
@@ -57,11 +60,13 @@ POOLS = {
     "sharp": Pool(16, (5.0, 16.0), (5e-6, 9.5e-6), ("flat",)),  # as those above, for training
     "lenses": Pool(20, (5.0, 30.0), (2.5e-6, 9e-6), ("flat",)),
     "slow": Pool(12, (25.0, 50.0), (2.5e-6, 9e-6), FAMILIES),
+    "sweeps": Pool(10, (5.0, 30.0), (2.5e-6, 9e-6), ("focal sweep", "like fishers")),
+    "corner": Pool(8, (14.0, 22.0), (4e-6, 8e-6), FAMILIES),  # in the field of a single element
     "validation": Pool(8, (4.5, 55.0), (2.2e-6, 9.5e-6), FAMILIES, hard=3),
     "test": Pool(12, (4.0, 60.0), (2e-6, 10e-6), (*FAMILIES, "cubic", "fresnel"), hard=5),
 }
 
-BESIDE_TRAINING = ("sharp", "lenses", "slow")
+BESIDE_TRAINING = ("sharp", "lenses", "slow", "sweeps", "corner")
 
 
 def pool_names(pool: str) -> list[str]:
@@ -83,21 +88,42 @@ def camera(name: str) -> TiDyOptics:
         optics = own_system(name).optics
     else:
         pool, _, index = name.rpartition("-")
-        optics = _drawn(POOLS[pool], name, int(index))
+        optics = (_behind_an_element if pool == "corner" else _drawn)(POOLS[pool], name, int(index))
     optics.sensor = None
     return optics.eval().requires_grad_(requires_grad=False)
 
 
-def _drawn(pool: Pool, name: str, index: int) -> TiDyOptics:
-    random = torch.Generator().manual_seed(keyed_seed(name, index))
+class _Draw:
+    """Numbers that follow from the name of a camera."""
 
-    def uniform(ends: tuple[float, float]) -> float:
+    def __init__(self, name: str, index: int) -> None:
+        self.generator = torch.Generator().manual_seed(keyed_seed(name, index))
+
+    def uniform(self, ends: tuple[float, float]) -> float:
+        """Return a number uniform in its logarithm."""
         low, high = (math.log(end) for end in ends)
-        return math.exp(low + (high - low) * float(torch.rand((), generator=random, dtype=torch.float64)))
+        return math.exp(low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64)))
 
-    def whole(count: int) -> int:
-        return int(torch.randint(count, (), generator=random))
+    def whole(self, count: int) -> int:
+        """Return a number below the count."""
+        return int(torch.randint(count, (), generator=self.generator))
 
+
+def _behind_an_element(pool: Pool, name: str, index: int) -> TiDyOptics:
+    draw = _Draw(name, index)
+    family, masks = pool.families[index % len(pool.families)], 1 + draw.whole(8)
+    f_number, pitch, focus = draw.uniform(pool.f_numbers), draw.uniform(pool.pitches), draw.uniform((0.5, 2.0))
+    lens = Lens.named(ELEMENT, f_number, focus)
+    shape = _masks(family, masks, draw.uniform(STRENGTH), draw.generator)
+    height, angle = lens.field / pitch * draw.uniform((0.4, 0.9)), math.tau * draw.whole(360) / 360
+    place = height * math.sin(angle), height * math.cos(angle)
+    fidelity = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
+    return TiDyOptics(shape, lens.camera(pitch), lens=lens, fidelity=fidelity, field_center=place)
+
+
+def _drawn(pool: Pool, name: str, index: int) -> TiDyOptics:
+    draw = _Draw(name, index)
+    random, uniform, whole = draw.generator, draw.uniform, draw.whole
     families = ("flat",) if index < pool.hard and index % 2 else pool.families
     slowest = (25.0, pool.f_numbers[1]) if index < pool.hard and not index % 2 else pool.f_numbers
     family, masks = families[whole(len(families))], 1 + whole(8)
@@ -121,6 +147,14 @@ def _drawn(pool: Pool, name: str, index: int) -> TiDyOptics:
     shape = _masks(family, masks, uniform(STRENGTH), random)
     fidelity = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
     return TiDyOptics(shape, lens, fidelity=fidelity)
+
+
+def local_bank(optics: TiDyOptics, layers: int) -> PSFBank:
+    """Return the PSFs that the closed form takes, those of the camera's place in the field behind a lens."""
+    if optics.lens is None:
+        return closed_form_bank(optics, layers)
+    nodes = torch.linspace(*optics.camera.defocus_range, layers, dtype=torch.float64).tolist()
+    return optics.psf_bank(3, defocus=nodes, field=[optics.field_center]).at(0)
 
 
 def _masks(family: str, count: int, strength: float, random: torch.Generator) -> PhaseMasks:

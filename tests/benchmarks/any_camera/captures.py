@@ -12,6 +12,7 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
+from torch.nn import functional
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.dead_leaves import dead_leaves
@@ -27,6 +28,8 @@ SCENES, SCENES_OF_SHIPPED = 32, 96
 LEVELS = 2**16 - 1
 STRIDE = 12  # between cameras whose captures are made one after the other, so that each kind comes early
 LEAVES_OF_PICTURES = 0.4  # share of photographs with the depth of leaves
+PICTURES = {"photographs": (40, 120), "more": (24, 60)}  # captures of whole ones by a camera, and by a shipped one
+SOFT = 4  # of the latter every fourth is magnified
 KINDS = ("leaves", "leaves", "leaves", "grain", "soft", "blank", "sharp")  # as often
 
 
@@ -98,20 +101,33 @@ def photograph_collages(folder: Path, photographs: Sequence[str], scenes: int = 
         _write({image: shown, light: seen})
 
 
-def photograph_pictures(folder: Path, photographs: Sequence[Path], scenes: int = 40) -> None:
+def photograph_pictures(folder: Path, photographs: Sequence[Path]) -> None:
     """Make captures of whole photographs by the cameras of training, those of shipped systems first; of these more."""
     names = pool_names("training")
-    for name in [*SHIPPED, *(one for first in range(STRIDE) for one in names[len(SHIPPED) + first :: STRIDE])]:
-        light, image = (folder / f"{name}-photographs-{part}.npy" for part in ("light", "image"))
-        if light.exists():
-            continue
-        optics, seen, shown = camera(name), [], []
-        for index in range(3 * scenes if name in SHIPPED else scenes):
-            scene, near = pictured_scene(photographs, keyed_seed(f"{name} photographs", index))
-            seen.append(photographed(optics, scene, near))
-            shown.append(rgb_to_linear_rgb(scene[None])[0])
-        _write({image: shown, light: seen})
-        print(name, flush=True)
+    ordered = [*SHIPPED, *(one for first in range(STRIDE) for one in names[len(SHIPPED) + first :: STRIDE])]
+    for kind, (scenes, of_shipped) in PICTURES.items():
+        for name in ordered:
+            light, image = (folder / f"{name}-{kind}-{part}.npy" for part in ("light", "image"))
+            if light.exists():
+                continue
+            optics, seen, shown = camera(name), [], []
+            for index in range(of_shipped if name in SHIPPED else scenes):
+                seed = keyed_seed(f"{name} {kind}", index)
+                scene, near = pictured_scene(photographs, seed)
+                if kind == "more" and index % SOFT == SOFT - 1:
+                    scene = magnified(scene, seed)
+                seen.append(photographed(optics, scene, near))
+                shown.append(rgb_to_linear_rgb(scene[None])[0])
+            _write({image: shown, light: seen})
+            print(name, kind, flush=True)
+
+
+def magnified(image: Tensor, seed: int) -> Tensor:
+    """Return a quarter of a picture at the size of the whole: soft, as a scene out of focus."""
+    side = image.shape[-1] // 2
+    first = seed % (image.shape[-1] - side)
+    part = rgb_to_linear_rgb(image[None, :, first : first + side, first : first + side])
+    return linear_rgb_to_rgb(functional.interpolate(part, image.shape[-2:], mode="bicubic").clamp(0, 1))[0]
 
 
 def pictured_scene(photographs: Sequence[Path], seed: int, side: int = SIDE) -> tuple[Tensor, Tensor]:

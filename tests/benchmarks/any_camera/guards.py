@@ -14,8 +14,8 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
+from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.pretrained import load_pretrained
-from kornia_tidy.reconstruction.ruled_closed_form import CLIPPED
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera
