@@ -95,9 +95,10 @@ def burst(
     check_part("optics", optics, TiDyOptics, "a camera such as TiDyOptics(PixelwiseMask(5))")
     sample = read_sample(image, depth, optics, field_center=field_center)
     shots, light = [], optics.psf_model.relative_light(sample.dtype)
-    for k, share in enumerate(burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)):
-        shot = optics.through_moment(k).irradiance(sample)
-        shot = shot * (share * light[k]).to(shot)
+    shares = burst_shares(_dwell_shares(optics, sample.dtype), dead_time, exposure)
+    seen = optics.irradiance(sample, [optics.through_moment(k) for k in range(len(shares))])
+    for own, share, passed in zip(seen, shares, light[: len(shares)], strict=True):
+        shot = own * (share * passed).to(own)
         shots.append(shot if optics.sensor is None else _sensor_for(optics.sensor, share)(shot, generator=generator))
     stack = torch.stack(shots, 1).to(sample.image.dtype)
     return stack if sample.batched else stack[0]

@@ -91,8 +91,8 @@ def moving_capture(
         total, clamped = torch.zeros(()), 0
         for moment, share in enumerate(durations * optics.psf_model.relative_light(dtype)):
             sample = read_sample(images[:, moment], depths[:, moment], optics, field_center=field_center)
-            light = optics.through_moment(moment).irradiance(sample) * share
-            total = light if moment == 0 else total + light
+            (light,) = optics.irradiance(sample, [optics.through_moment(moment)])
+            total = light * share if moment == 0 else total + light * share
             clamped += optics.clamped_pixels
         optics.notes.clamped = clamped
         if optics.sensor is not None:

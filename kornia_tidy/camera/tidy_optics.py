@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import reduce
@@ -304,17 +304,24 @@ class TiDyOptics(CameraState):
         for own, image, depth, places in strips_of(sample, *given):
             yield Strip(self.decode(image), self.defocus(depth), reach, "valid", own, places)
 
-    def irradiance(self, sample: Sample) -> Tensor:
-        """Return the irradiance of a scene on the sensor, (B, C, h, w), over the whole exposure."""
-        whole, device = None, sample.image.device
+    def irradiance(self, sample: Sample, views: Sequence[TiDyOptics]) -> list[Tensor]:
+        """Return the irradiance of a scene on the sensor, (B, C, h, w), through each of some views of this camera.
+
+        Args:
+            sample: image and depth, see :func:`kornia_tidy.camera.samples.read_sample`.
+            views: of its moments, such as :meth:`through_moment` gives.
+        """
+        found: list[Any] = [None] * len(views)
+        device = sample.image.device
         with (
             torch.autocast(device.type, enabled=False),
             nullcontext() if device.type == "cpu" else values_unread(device),
         ):
             for strip in self.strips(sample):
-                part = self.blurred(strip)
-                whole = part if strip.rows is None else placed(whole, part, strip.rows, self.height(sample))
-        return cast("Tensor", whole)
+                for n, view in enumerate(views):
+                    part = view.blurred(strip)
+                    found[n] = part if strip.rows is None else placed(found[n], part, strip.rows, self.height(sample))
+        return found
 
     def height(self, sample: Sample) -> int:
         """Return how many rows a capture has."""
