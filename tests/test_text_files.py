@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data import NYUDepthV2, TUMSequence, described_folder
+from kornia_tidy.data import TUMSequence, described_folder
 from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.figures.learning_curve import draw_learning_curve
 from kornia_tidy.files import read_text
@@ -21,7 +21,6 @@ from kornia_tidy.training.callbacks import drop_rows_after
 from kornia_tidy.training.coded_datasets.index import read_index
 from kornia_tidy.training.record import training_record
 from tests.base import BaseTester
-from tests.data.published import write_nyu
 
 FORMS = ("utf-8-sig", "utf-16", "utf-32", "utf-16-be with mark")
 CALIB = "cam0=[3997.5 0 1176.7; 0 3997.5 1011.7; 0 0 1]\ndoffs=131.25\nbaseline=193.5\n"
@@ -54,12 +53,6 @@ def _described(folder):
         assert cv2.imwrite(str(folder / name), values)
     (folder / "rgbd.json").write_text('{"image": "*.png", "depth": "*_depth.png"}')
     return [folder / "rgbd.json"], lambda: described_folder(folder).pairs
-
-
-def _split(folder):
-    write_nyu(folder, 2)
-    (folder / "mine.txt").write_text("2\n1\n")
-    return [folder / "mine.txt"], lambda: [sample["name"] for sample in NYUDepthV2(folder, folder / "mine.txt")]
 
 
 def _validation(folder):
@@ -123,7 +116,6 @@ KINDS = (
     _times,
     _listed,
     _described,
-    _split,
     _validation,
     _curve,
     _log,

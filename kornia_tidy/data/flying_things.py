@@ -15,6 +15,7 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import find_files
 
+FRAMES = "frames_cleanpass"
 FOCAL_PX = 1050.0  # 35 mm on a sensor 32 mm and 960 pixels wide
 NEAREST = 160.0  # px of disparity; values found range from 1.1 to 152
 SOURCE = "https://lmb.informatik.uni-freiburg.de/resources/datasets/SceneFlowDatasets.en.html"
@@ -31,9 +32,6 @@ class FlyingThings3D(SceneDataset):
         root: the folder that holds ``frames_cleanpass`` (PNG) or ``frames_cleanpass_webp``, and ``disparity``, as
             published.
         split: the published split; its parts share no object and no texture.
-        frames: ``"cleanpass"`` is sharp everywhere. ``"finalpass"`` has motion blur and defocus.
-        view: which of the two cameras.
-        subsets: which of the parts A, B and C; they differ in the motion of objects and camera.
         baseline_m: B, assumed distance between the two cameras in metres. Default: 1.
         disparity_range: (far, near) in pixels: depth is then the disparity, scaled to 0 at far and 1 at near,
             for a camera of :class:`~kornia_tidy.DefocusRange`. Disparities outside are clamped, and False in the
@@ -45,6 +43,7 @@ class FlyingThings3D(SceneDataset):
         ValueError: if frames have no disparity, or an argument is not as above.
 
     Convention:
+        - Frames are those of the left camera, sharp everywhere, of the parts A, B and C that are there.
         - The data have no metric scale: the cameras are 1 unit apart. With a unit of one metre the median disparities
           of the frames examined (26 to 46 pixels) are 23 to 40 m; with ``baseline_m=0.05`` they are 1.1 to 2.0 m.
         - A name is the published path without its suffix, ``"TRAIN/A/0000/left/0006"``.
@@ -58,34 +57,23 @@ class FlyingThings3D(SceneDataset):
         root: str | os.PathLike[str],
         split: Literal["train", "test"] = "train",
         *,
-        frames: Literal["cleanpass", "finalpass"] = "cleanpass",
-        view: Literal["left", "right"] = "left",
-        subsets: str = "ABC",
         baseline_m: float | None = None,
         disparity_range: tuple[float, float] | None = None,
         transform: Transform | None = None,
     ) -> None:
         super().__init__(transform)
         check_choice("split", split, ("train", "test"))
-        check_choice("frames", frames, ("cleanpass", "finalpass"))
-        check_choice("view", view, ("left", "right"))
-        if not subsets or not set(subsets) <= set("ABC"):
-            raise ValueError(f"subsets must be some of the letters of 'ABC', got {subsets!r}")
         if disparity_range is not None:
             _check_disparity_range(disparity_range, baseline_m)
         self.baseline_m = 1.0 if baseline_m is None else baseline_m
         check_positive("baseline_m", self.baseline_m, "metres")
         self.root = Path(root)
         self.disparity_range = disparity_range
-        self.folder, self.suffix = _frames_folder(self.root, frames)
-        self.names = [
-            name
-            for subset in sorted(set(subsets))
-            for name in _list_names(self.folder, f"{split.upper()}/{subset}", view, self.suffix)
-        ]
+        self.folder, self.suffix = _frames_folder(self.root)
+        self.names = _list_names(self.folder, split.upper(), self.suffix)
         if not self.names:
-            raise FileNotFoundError(f"{self.folder} has no {view} frames *{self.suffix} of {split.upper()} {subsets}")
-        self._check_disparities(split, view, subsets)
+            raise FileNotFoundError(f"{self.folder} has no left frames *{self.suffix} of {split.upper()}")
+        self._check_disparities(split.upper())
 
     def read(self, index: int) -> Scene:
         """Read a frame and its disparity."""
@@ -99,13 +87,11 @@ class FlyingThings3D(SceneDataset):
         level = (1 / scene.depth - far) / (near - far)
         return Scene(scene.image, level.clamp(0, 1), scene.valid & (level >= 0) & (level <= 1))
 
-    def _check_disparities(self, split: str, view: str, subsets: str) -> None:
+    def _check_disparities(self, part: str) -> None:
         """Raise ``ValueError`` if a frame has no disparity file."""
         disparity = self.root / "disparity"
-        parts = [f"{split.upper()}/{subset}" for subset in sorted(set(subsets))]
-        known = {name for part in parts for name in _list_names(disparity, part, view, ".pfm")}
-        unpaired = [name for name in self.names if name not in known]
-        if unpaired:
+        known = set(_list_names(disparity, part, ".pfm"))
+        if unpaired := [name for name in self.names if name not in known]:
             raise ValueError(
                 f"{len(unpaired)} of {len(self.names)} frames have no disparity, the first is {unpaired[0]}: "
                 f"there is no {disparity / unpaired[0]}.pfm"
@@ -191,24 +177,20 @@ def _check_disparity_range(disparity_range: tuple[float, float], baseline_m: flo
         )
 
 
-def _frames_folder(root: Path, frames: str) -> tuple[Path, str]:
+def _frames_folder(root: Path) -> tuple[Path, str]:
     """Return the folder of the frames and their suffix; PNG is preferred to WebP."""
-    for folder, suffix in ((root / f"frames_{frames}", ".png"), (root / f"frames_{frames}_webp", ".webp")):
+    for folder, suffix in ((root / FRAMES, ".png"), (root / f"{FRAMES}_webp", ".webp")):
         if folder.is_dir() and (root / "disparity").is_dir():
             return folder, suffix
     raise FileNotFoundError(
-        f"FlyingThings3D is not in {root}: download 'RGB images ({frames})', as PNG or WebP, and 'Disparity' of "
+        f"FlyingThings3D is not in {root}: download 'RGB images (cleanpass)', as PNG or WebP, and 'Disparity' of "
         f"FlyingThings3D from {SOURCE}, and unpack both there, so that there are "
-        f"{root / f'frames_{frames}' / 'TRAIN/A/0000/left/0006.png'} and "
+        f"{root / FRAMES / 'TRAIN/A/0000/left/0006.png'} and "
         f"{root / 'disparity/TRAIN/A/0000/left/0006.pfm'}"
     )
 
 
-def _list_names(folder: Path, part: str, view: str, suffix: str) -> list[str]:
+def _list_names(folder: Path, part: str, suffix: str) -> list[str]:
     """Return the published paths in a part, sorted, without suffix; other files than numbered ones are left out."""
-    if not (folder / part).is_dir():
-        raise FileNotFoundError(
-            f"{folder} has no {part}: unpack the whole archive, or name the parts that are there with subsets="
-        )
-    files = find_files(folder / part, f"[0-9]*/{view}/[0-9]*{suffix}")
+    files = find_files(folder / part, f"[ABC]/[0-9]*/left/[0-9]*{suffix}")
     return sorted(file.relative_to(folder).with_suffix("").as_posix() for file in files)

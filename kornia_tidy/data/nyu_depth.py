@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from kornia_tidy.checks import check_choice
 from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import read_text
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.search_path import import_extra, import_installed
 
@@ -32,11 +31,7 @@ class NYUDepthV2(SceneDataset):
 
     Args:
         root: the folder that holds ``nyu_depth_v2_labeled.mat`` and ``splits.mat``, as published.
-        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``; ``"all"``; or
-            the path of a text file with the numbers of frames, from 1, one per line.
-        raw: the depth that the Kinect measured, with holes filled from the nearest known pixel and False in the mask.
-            Default: the published depth, whose holes were filled by colour (Levin et al.).
-        crop_border: crop the frame to the 427x561 pixels on which methods are evaluated, without its white border.
+        split: ``"train"`` (795 frames) or ``"test"`` (654) by ``splits.mat``, or ``"all"``.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
@@ -45,6 +40,8 @@ class NYUDepthV2(SceneDataset):
         ValueError: if a file is damaged or has other contents.
 
     Convention:
+        - Depth is the published one, whose holes were filled by colour (Levin et al.), on the 427x561 pixels on which
+          methods are evaluated, without the white border.
         - A name is the published number of the frame, from ``"0001"`` to ``"1449"``.
         - The file is opened and closed for each item, as an open HDF5 file does not survive a fork. This takes 0.5 ms
           of the 10 ms for an item.
@@ -55,18 +52,16 @@ class NYUDepthV2(SceneDataset):
     def __init__(
         self,
         root: str | os.PathLike[str],
-        split: str | os.PathLike[str] = "train",
+        split: Literal["train", "test", "all"] = "train",
         *,
-        raw: bool = False,
-        crop_border: bool = True,
         transform: Transform | None = None,
     ) -> None:
         super().__init__(transform)
         self.path = _published(Path(root), LABELED)
-        self.depths = "rawDepths" if raw else "depths"
-        self.crop_border = crop_border
+        check_choice("split", split, ("train", "test", "all"))
         count = self._count()
-        self.numbers = range(1, count + 1) if split == "all" else _read_split(Path(root), split)
+        whole = split == "all"
+        self.numbers = range(1, count + 1) if whole else _read_split(_published(self.path.parent, SPLITS), split)
         self.names = [f"{number:04d}" for number in self.numbers]
         outside = [number for number in self.numbers if not 1 <= number <= count]
         if outside:
@@ -77,12 +72,11 @@ class NYUDepthV2(SceneDataset):
         row = self.numbers[index] - 1
         with _open(self.path) as file:
             try:
-                image, depth = file["images"][row], file[self.depths][row]
+                image, depth = file["images"][row], file["depths"][row]
             except DAMAGE as error:
                 raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
         # MATLAB stores columns, HDF5 rows: (480, 640, 3) is read as (3, 640, 480).
-        window = INSIDE if self.crop_border else (slice(None), slice(None))
-        image, depth = image.transpose(0, 2, 1)[:, *window], np.ascontiguousarray(depth.T[window], np.float32)
+        image, depth = image.transpose(0, 2, 1)[:, *INSIDE], np.ascontiguousarray(depth.T[INSIDE], np.float32)
         if not (depth > 0).any():  # False for NaN too
             raise ValueError(f"cannot read {self.path}: the frame has no valid depth at any pixel")
         filled, known = fill_holes(depth)
@@ -96,13 +90,13 @@ class NYUDepthV2(SceneDataset):
         """Return the number of frames; raise ``ValueError`` if images or depths are missing or of another shape."""
         with _open(self.path) as file:
             try:
-                shapes = {key: getattr(stored_numbers(file, key), "shape", None) for key in ("images", self.depths)}
+                shapes = {key: getattr(stored_numbers(file, key), "shape", None) for key in ("images", "depths")}
             except (*DAMAGE, ValueError) as error:
                 raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
         images = shapes["images"]
         count = images[0] if images else 0
         height, width = FRAME
-        wanted = {"images": (count, 3, width, height), self.depths: (count, width, height)}
+        wanted = {"images": (count, 3, width, height), "depths": (count, width, height)}
         if shapes != wanted or not count:
             raise ValueError(f"cannot read {self.path}: it should hold {wanted} (N first), found {shapes}")
         return count
@@ -127,34 +121,12 @@ def _open(path: Path) -> Any:
         ) from error
 
 
-def _read_split(root: Path, split: str | os.PathLike[str]) -> list[int]:
-    if split in {"train", "test"}:
-        path = _published(root, SPLITS)
-        numbers = _read_splits_mat(path, f"{split}Ndxs")
-    else:
-        path = Path(split)
-        try:
-            words = read_text(path, "replace").split()
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"split must be 'train', 'test', 'all' or a text file of numbers: {error}"
-            ) from error
-        try:
-            numbers = np.array([int(word) for word in words])
-        except ValueError as error:
-            raise ValueError(
-                f"cannot read {path}: it should hold the numbers of frames, one a line: {error}"
-            ) from error
-    if not len(numbers) or len(np.unique(numbers)) != len(numbers):
-        raise ValueError(f"cannot read {path}: it should name frames, each once, found {len(numbers)} numbers")
-    return numbers.tolist()
-
-
-def _read_splits_mat(path: Path, key: str) -> NDArray[Any]:
+def _read_split(path: Path, split: str) -> list[int]:
+    key = f"{split}Ndxs"
     loadmat = import_installed("scipy.io").loadmat  # only this needs it
     if path.stat().st_size > LARGEST_SPLITS:
         raise ValueError(f"cannot read {path}: it must have at most {LARGEST_SPLITS} bytes, got {path.stat().st_size}")
     try:
-        return loadmat(path, variable_names=[key])[key].ravel().astype(int)
+        return loadmat(path, variable_names=[key])[key].ravel().astype(int).tolist()
     except Exception as error:  # of any type, for damaged files
         raise ValueError(f"cannot read {path}: it should hold trainNdxs and testNdxs: {error!r}") from error

@@ -10,6 +10,7 @@ from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import find_files
 
+DEPTH = "depth_bfx"  # folder of the improved depth
 ROTATED_BITS = 3  # to the left, in the published files
 
 
@@ -17,10 +18,8 @@ class SUNRGBD(SceneDataset):
     """Data set of the frames of SUN RGB-D, as published.
 
     Args:
-        root: folder ``SUNRGBD`` or a part of it, such as ``SUNRGBD/kv2``. Each frame is a folder that holds ``image``,
-            ``depth`` and ``depth_bfx``, each with one file.
-        raw: the measured depth, ``depth``. Default: ``depth_bfx``, whose holes were filled by the publishers from
-            several frames.
+        root: folder ``SUNRGBD`` or a part of it, such as ``SUNRGBD/kv2``. Each frame is a folder that holds ``image``
+            and ``depth_bfx``, each with one file.
         transform: see :class:`~kornia_tidy.data.scene_dataset.SceneDataset`, which also describes the items.
 
     Raises:
@@ -28,6 +27,7 @@ class SUNRGBD(SceneDataset):
         ValueError: if a frame does not have one image and one depth.
 
     Convention:
+        - Holes of ``depth_bfx`` were filled by the publishers from several frames.
         - Depth is in millimetres once the bits are rotated back, and 0 is unknown. The publishers' code clips it at
           8 m; it is not clipped here.
         - A name is the path of a frame's folder.
@@ -35,18 +35,17 @@ class SUNRGBD(SceneDataset):
     Source: Song et al., SUN RGB-D (CVPR 2015), with the bit rotation of its toolbox.
     """
 
-    def __init__(self, root: str | os.PathLike[str], *, raw: bool = False, transform: Transform | None = None) -> None:
+    def __init__(self, root: str | os.PathLike[str], *, transform: Transform | None = None) -> None:
         super().__init__(transform)
         self.root = Path(root)
-        part = "depth" if raw else "depth_bfx"
         if not self.root.is_dir():
             raise FileNotFoundError(f"there is no folder {self.root}")
-        files = chain.from_iterable(find_files(self.root, f"**/{name}/*") for name in ("image", part))
+        files = chain.from_iterable(find_files(self.root, f"**/{name}/*") for name in ("image", DEPTH))
         folders = sorted({file.parent.parent for file in files})
-        frames = [folder for folder in folders if (folder / "image").is_dir() and (folder / part).is_dir()]
+        frames = [folder for folder in folders if (folder / "image").is_dir() and (folder / DEPTH).is_dir()]
         if not frames:
-            raise FileNotFoundError(f"SUN RGB-D is not in {self.root}: a frame is a folder with image/ and {part}/")
-        self.pairs = [(_only_file(frame / "image"), _only_file(frame / part)) for frame in frames]
+            raise FileNotFoundError(f"SUN RGB-D is not in {self.root}: a frame is a folder with image/ and {DEPTH}/")
+        self.pairs = [(_only_file(frame / "image"), _only_file(frame / DEPTH)) for frame in frames]
         self.names = [frame.relative_to(self.root).as_posix() for frame in frames]
 
     def read(self, index: int) -> Scene:

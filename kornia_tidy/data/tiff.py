@@ -17,16 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.tiff_directories import DESCRIPTION, PHOTOMETRIC, Directory, picture_directories
-from kornia_tidy.data.tiff_segments import JPEG, Layout, decode_segments, layout_of
+from kornia_tidy.data.tiff_segments import JPEG, Layout, decode_segments, layout_of, named
 
 ORIENTATION, COLOUR_MAP, EXTRA_SAMPLES, GDAL_METADATA, GDAL_NODATA = 274, 320, 338, 42112, 42113
 
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _COLOURS = {_WHITE_IS_ZERO: 1, _BLACK_IS_ZERO: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}  # samples without extra ones
-_REFUSED = {
-    4: "a transparency mask", 5: "separated inks such as CMYK", 8: "CIE L*a*b*", 9: "ICC L*a*b*", 10: "ITU L*a*b*",
-    32844: "LogL", 32845: "LogLuv", 51177: "a depth map of a DNG", 52527: "a photometric mask of a DNG",
-}  # fmt: skip
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # kinds of alpha: colours are multiplied by the first
 _UNSIGNED, _SIGNED, _FLOAT = 1, 2, 3  # SampleFormat
 _SCALE = re.compile(rb'<Item [^<>]{0,200}role="(scale|offset)"[^<>]{0,200}>([^<>]{1,40})</Item>')
@@ -93,8 +89,8 @@ def _photometric(directory: Directory, layout: Layout) -> int:
     """Return the photometric interpretation; raise ``ValueError`` for unsupported ones."""
     photometric = directory.number(PHOTOMETRIC, _RGB if layout.samples > 2 else _BLACK_IS_ZERO)
     if photometric not in _COLOURS:
-        name = _REFUSED.get(photometric, "of an unknown meaning")
-        raise ValueError(f"its pixels are {name} (photometric interpretation {photometric}), which is not read")
+        name = f"photometric interpretation {photometric}, {named('PHOTOMETRIC', photometric)}"
+        raise ValueError(f"the meaning of its pixels is not read ({name})")
     if photometric == _YCBCR and (layout.compression, layout.planes, layout.samples) != (JPEG, 1, 3):
         raise ValueError(
             "its pixels are YCbCr (photometric interpretation 6), which is read with JPEG in one plane only"

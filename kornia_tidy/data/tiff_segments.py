@@ -32,13 +32,6 @@ JPEG, CCITT = 7, (2, 3, 4)
 UNFOLDS = {1: 1, 2: 1 << 16, 3: 1 << 16, 4: 1 << 16, 5: 1 << 12, 7: 1 << 11, 8: 1 << 11, 32773: 64, 32946: 1 << 11,
            34925: 1 << 14, 50000: 1 << 16}  # fmt: skip
 """Compressions that are read, and the most bytes that one byte can unfold to."""
-COMPRESSIONS = {
-    6: "old-style JPEG", 9: "JBIG", 10: "JBIG", 32766: "NeXT", 32771: "CCITT with words", 32809: "ThunderScan",
-    32908: "PixarFilm", 32909: "PixarLog", 33003: "JPEG 2000", 33004: "JPEG 2000", 33005: "JPEG 2000",
-    33007: "JPEG", 34661: "JBIG", 34676: "SGILog", 34677: "SGILog", 34712: "JPEG 2000", 34715: "JBIG2",
-    34887: "LERC", 34892: "lossy JPEG", 34926: "Zstandard, old number", 34927: "WebP, old number", 34933: "PNG",
-    34934: "JPEG XR", 48124: "Jetraw", 50001: "WebP", 50002: "JPEG XL", 52546: "JPEG XL",
-}  # fmt: skip
 _RGB, _YCBCR = 2, 6  # photometric interpretations
 _JPEG_PROCESSES = (0, 1, 2)  # baseline, extended, progressive
 _PREDICTED = (5, 8, 32946, 34925, 50000)  # compressions that may come with a predictor
@@ -171,7 +164,7 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
     """Return the compression; raise ``ValueError`` unless it is read, for these samples and with this predictor."""
     compression, predictor = directory.number(COMPRESSION, 1), directory.number(PREDICTOR, 1)
     if compression not in UNFOLDS:
-        raise ValueError(f"its compression is {compression} ({COMPRESSIONS.get(compression, 'unknown')}), not read")
+        raise ValueError(f"its compression is {compression} ({named('COMPRESSION', compression)}), not read")
     if compression != 1:
         try:
             _tifffile().TIFF.DECOMPRESSORS[compression]
@@ -276,6 +269,12 @@ def _jpeg_rows(coded: bytes, high: int, layout: Layout, title: str) -> int:
     if frame.columns != layout.segment[1] or frame.rows not in {high, layout.segment[0]}:
         raise ValueError(f"the file is damaged: {title} is a JPEG of {frame.rows} x {frame.columns} pixels")
     return frame.rows
+
+
+def named(kind: str, value: int) -> str:
+    """Return the name that an enumeration of tifffile has for a value."""
+    names = getattr(_tifffile(), kind)
+    return names(value).name if value in set(names) else "unknown"
 
 
 @cache

@@ -18,9 +18,9 @@ from kornia_tidy.figures.style import (
     PHASE_COLORS,
     SMALL,
     TITLE,
+    new_figure,
     open_chart,
     quiet,
-    require_matplotlib,
 )
 
 if TYPE_CHECKING:
@@ -51,10 +51,7 @@ def draw_co_design(design: CoDesign) -> Figure:
         - PSFs are those of 530 nm, from far (left) to near, each scaled to its own brightest pixel, linear in the
           square root of the light. Masks are modulo one wave.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
+    figure = new_figure(WIDTH, HEIGHT, layout=None)
     figure.text(0.03, 0.955, design.words[0].upper() + design.words[1:], fontsize=TITLE + 1.5, color=INK, weight="bold")
     _search(figure.add_axes((0.075, 0.56, 0.39, 0.33)), design)
     _scores(figure.add_axes((0.575, 0.56, 0.39, 0.33)), design)

@@ -11,7 +11,7 @@ from kornia.filters import box_blur
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.figures.style import ACCENT, INK, LABEL, TITLE, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, INK, LABEL, TITLE, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,15 +50,12 @@ def draw_comparison(rows: Sequence[Sequence[Panel | None]], title: str, subtitle
         ImportError: if matplotlib is missing.
         ValueError: if the first place is empty.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     if not rows or not rows[0] or rows[0][0] is None:
         raise ValueError("the first picture of a comparison must be the scene, and there is none")
     scene = rows[0][0].picture
     columns = max(map(len, rows))
     tall = (COLUMN * scene.shape[-2] / scene.shape[-1] + 0.6) * len(rows) + 0.3 * len(notes) + 0.9
-    figure = Figure(figsize=(columns * (COLUMN + 0.2), tall), facecolor="white", layout="constrained")
+    figure = new_figure(columns * (COLUMN + 0.2), tall)
     figure.suptitle(f"{title}\n{subtitle}", fontsize=TITLE + 1.5, color=INK)
     figure.supxlabel("\n".join(notes), fontsize=LABEL, color=INK, x=0.01, ha="left")
     place = detail_of(scene)

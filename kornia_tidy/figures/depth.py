@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, SMALL, quiet, require_matplotlib
+from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, SMALL, new_figure, quiet
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 if TYPE_CHECKING:
@@ -37,9 +37,6 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
     Raises:
         ImportError: if matplotlib is missing.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     height, width = depth.shape[-2:]
     step = max(1, max(height, width) // 1800)
     shown = depth[0, ::step, ::step].detach().cpu()
@@ -47,7 +44,7 @@ def draw_depth(depth: Tensor, camera: ThinLensCamera, deviation: Tensor | None =
     place = ((shown.reciprocal() - far) / (near - far)).clamp(0, 1).numpy()
     scale = LONGER_SIDE / max(height, width)
     across, up, below = max(width * scale, 3.0), height * scale, 0.45  # inches
-    figure = Figure(figsize=(across, up + below), facecolor="white")
+    figure = new_figure(across, up + below, layout=None)
     axes = figure.add_axes(
         ((1 - width * scale / across) / 2, below / (up + below), width * scale / across, up / (up + below))
     )

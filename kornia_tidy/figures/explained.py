@@ -10,7 +10,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at, depth_bar, depth_colors, metres
-from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, quiet, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, new_figure, quiet
 from kornia_tidy.masks.base import central_square
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
@@ -47,13 +47,10 @@ def explain(
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light.
         - PSFs are in the orientation of the image; so are masks.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     camera = optics.camera
     if not isinstance(camera, ThinLensCamera):
         raise TypeError(f"explain needs a ThinLensCamera, whose depths are metres, got {type(camera).__name__}")
-    figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white", layout="constrained")
+    figure = new_figure(WIDTH, HEIGHT)
     figure.suptitle(f"One exposure, several phase masks: {ABOUT}", size=TITLE, weight="bold", color=INK)
     figure.supxlabel(caption, size=SMALL, color=FAINT)
     parts: Any = figure.subfigures(1, 3, width_ratios=(2.3, 5.6, 2.3))

@@ -16,7 +16,7 @@ from kornia_tidy.figures.field_measures import (
     heights_to_corner,
     measures_over_field,
 )
-from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, open_chart, require_matplotlib
+from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, new_figure, open_chart, require_matplotlib
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 if TYPE_CHECKING:
@@ -72,11 +72,9 @@ def draw_field(measured: FieldMeasures, airy: float) -> Figure:
         measured: PSFs, contrast and rays.
         airy: radius of the first dark ring of an ideal lens in pixels, drawn around the rays.
     """
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     (rows, columns), sides = measured.psfs.shape[:2], _sides(measured)
     tall = CELL * (rows + 1)
-    figure = Figure(figsize=(WIDTH, tall + PLOTS), facecolor="white", layout="constrained")
+    figure = new_figure(WIDTH, tall + PLOTS)
     words = f"field points right of the axis, pixels of {1e6 * measured.pitch:.3g} µm; each colour about its chief ray"
     figure.suptitle(f"{measured.lens}: {words}", fontsize=LABEL + 2, color=INK)
     above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, open_chart, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, new_figure, open_chart, require_matplotlib
 from kornia_tidy.files import read_text
 
 if TYPE_CHECKING:
@@ -78,9 +78,7 @@ def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
 
 
 def _drawn(folder: Path, losses: NDArray[np.float64], name: str, decibels: list[float], steps: list[int]) -> Figure:
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
+    figure = new_figure(WIDTH, HEIGHT, layout=None)
     left, right = figure.add_axes((0.08, 0.14, 0.39, 0.66)), figure.add_axes((0.57, 0.14, 0.41, 0.66))
     parts = np.array_split(losses, SMOOTHING)
     means = np.array([part.mean(0) for part in parts if len(part)])

@@ -19,7 +19,7 @@ from kornia_tidy.figures.style import (
     RED,
     SMALL,
     TITLE,
-    require_matplotlib,
+    new_figure,
 )
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
@@ -54,9 +54,6 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
         - Uncertainty and residual are means over the channels, in units of the PSF's brightest value. Each row has one
           scale, which is written beside it.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     if isinstance(measured.bank, FieldBank):
         raise TypeError("PSFs of one place are drawn, got those of several: draw the measurement of each place")
     count = len(measured.distances)
@@ -72,7 +69,7 @@ def draw_measured(measured: MeasuredPSFs, fit: MaskFit | None = None) -> Figure:
         left = (psfs - fit.psfs.cpu()).mean(1) / peak
         rows += [("the fitted mask's", fit.psfs.cpu(), None), ("measured less fitted", left, float(left.abs().max()))]
     width, height = max(7.5, CELL * (len(columns) + 1.6)), CELL * (len(rows) + 0.5) + 2.2
-    figure = Figure(figsize=(width, height), facecolor="white", layout="constrained")
+    figure = new_figure(width, height)
     parts: Any = figure.subfigures(2, 1, height_ratios=(CELL * (len(rows) + 0.5), 2.2))
     above, below = parts[0], parts[1]
     table = above.subplots(len(rows), len(columns), squeeze=False)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from kornia_tidy.figures.psf_measures import PSFMeasures
-from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, open_chart, require_matplotlib
+from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, new_figure, open_chart
 from kornia_tidy.figures.system_statistics import ring_centres
 
 if TYPE_CHECKING:
@@ -35,13 +35,10 @@ def draw_psfs(measured: PSFMeasures, title: str) -> Figure:
         - Each PSF of the montage is scaled to its own brightest pixel. Both colour scales are linear in the square root
           of the light, so that faint parts are visible.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     columns, rows = measured.psfs.shape[:2]
     tall = CELL * rows + 0.6
     size = max(8.5, CELL * columns + 2), tall + PLOTS + 0.4
-    figure = Figure(figsize=size, facecolor="white", layout="constrained")
+    figure = new_figure(*size)
     figure.suptitle(title, fontsize=HEADLINE, color=INK, weight="bold")
     above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))
     _montage(above, measured)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kornia_tidy.files import write_bytes
 from kornia_tidy.search_path import import_extra
@@ -27,6 +27,18 @@ def require_matplotlib() -> None:
         ImportError: if matplotlib is missing.
     """
     import_extra("matplotlib.figure", "a picture")
+
+
+def new_figure(width: float, height: float, layout: Any = "constrained") -> Figure:
+    """Return an empty white figure of inches.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    return Figure(figsize=(width, height), facecolor="white", layout=layout)
 
 
 def encoded_figure(figure: Figure, dpi: float = 150, format: str = "png") -> bytes:  # noqa: A002 (as matplotlib has it)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.figures.depth import depth_at, depth_colors
-from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, FAINT, INK, LABEL, PHASE_COLORS, SMALL, TITLE, new_figure
 from kornia_tidy.figures.system_statistics import SystemStatistics
 from kornia_tidy.masks.base import central_square
 from kornia_tidy.optics.published_systems import System
@@ -82,13 +82,10 @@ def draw_systems(portraits: Sequence[Portrait], image: Tensor, inverse_depth: Te
         - Each PSF is scaled to its own brightest value and drawn with the square root of its light; the bar is 10 px.
         - Near is left everywhere. Contrast is drawn as a colour, with the contrast of the channels as red, green, blue.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     if not portraits:
         raise ValueError("there is nothing to draw: no systems were given")
     rows = len(portraits) + 1
-    figure = Figure(figsize=(sum(WIDTHS) + 1, 1.35 * rows + 0.7), layout="constrained")
+    figure = new_figure(sum(WIDTHS) + 1, 1.35 * rows + 0.7)
     figure.suptitle("Published optical systems, side by side", size=1.7 * TITLE, weight="bold", color=INK)
     figure.supxlabel(CAPTION, size=LABEL, color=FAINT, x=0.01, ha="left")
     places = figure.subplots(rows, len(WIDTHS), width_ratios=WIDTHS, squeeze=False)

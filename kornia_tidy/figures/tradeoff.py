@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from kornia_tidy.design.tradeoff.files import TradeRun, value_in_words
 from kornia_tidy.design.tradeoff.measure import TradeRow, pareto
 from kornia_tidy.design.tradeoff.sweep_settings import PLAN, PRESET, SWEEP_VALUES
-from kornia_tidy.figures.style import FAINT, INK, open_chart, require_matplotlib
+from kornia_tidy.figures.style import FAINT, INK, new_figure, open_chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,10 +41,7 @@ def draw_trade(run: TradeRun) -> Figure:
     """
     if not run.rows:
         raise ValueError("there is nothing to draw: the sweep has no rows")
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    figure = Figure(figsize=(WIDTH, HEIGHT), facecolor="white")
+    figure = new_figure(WIDTH, HEIGHT, layout=None)
     axes = figure.add_axes((0.085, 0.125, 0.635, 0.735))
     floor = min((row.rmse for row in run.rows if row.rmse > 0), default=1.0) / GAP
     _frame(axes, run, floor)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, open_chart, require_matplotlib
+from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, new_figure, open_chart
 from kornia_tidy.lab.calibration.noise.photon_transfer import ROUNDING, PhotonTransfer
 
 if TYPE_CHECKING:
@@ -33,11 +33,8 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
     """
     if not result.points:
         raise ValueError("there is nothing to draw: the calibration has no points")
-    require_matplotlib()
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
     line, gain = result.line, result.line.gain
-    figure = Figure(figsize=(8.5, 5.0), facecolor="white", layout="constrained")
+    figure = new_figure(8.5, 5.0)
     axes = figure.subplots()
     for name in dict.fromkeys(point.channel for point in result.points):
         own = [point for point in result.points if point.channel == name and point.level > 0]

@@ -32,12 +32,12 @@ class TestData:
 
     def test_frame_of_flying_things(self, bench, size, tmp_path):
         write_flying_things(tmp_path, {"TRAIN/A": 1}, size=(size, size))
-        frames = FlyingThings3D(tmp_path, subsets="A", disparity_range=(0, 160))
+        frames = FlyingThings3D(tmp_path, disparity_range=(0, 160))
         bench(lambda: frames[0])
 
     def test_patch_of_a_quarter_of_a_frame(self, bench, size, tmp_path):
         write_flying_things(tmp_path, {"TRAIN/A": 1}, size=(size, size))
-        patches = Patches(FlyingThings3D(tmp_path, subsets="A", disparity_range=(0, 160)), size // 2)
+        patches = Patches(FlyingThings3D(tmp_path, disparity_range=(0, 160)), size // 2)
         bench(lambda: patches[0])
 
     def test_pair_in_a_folder(self, bench, size, tmp_path):

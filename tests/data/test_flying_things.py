@@ -27,8 +27,6 @@ class TestFlyingThings3D(BaseTester):
         [
             ({}, "TRAIN/A/0000/left/0006", 8),
             ({"split": "test"}, "TEST/A/0000/left/0006", 6),
-            ({"view": "right"}, "TRAIN/A/0000/right/0006", 8),
-            ({"subsets": "CB"}, "TRAIN/B/0000/left/0006", 4),
         ],
     )
     def test_cardinality(self, root, options, first, length):
@@ -42,12 +40,11 @@ class TestFlyingThings3D(BaseTester):
         """The files' red is 8 times their disparity, which differs from frame to frame."""
         seen = []
         for split in ("train", "test"):
-            for view in ("left", "right"):
-                for sample in FlyingThings3D(root, split, view=view):
-                    disparity = 1050.0 / sample["depth"][0]
-                    self.assert_close(8 * disparity / 255, sample["image"][0])
-                    seen.append(disparity)
-        assert len(torch.stack(seen).round().unique(dim=0)) == 28
+            for sample in FlyingThings3D(root, split):
+                disparity = 1050.0 / sample["depth"][0]
+                self.assert_close(8 * disparity / 255, sample["image"][0])
+                seen.append(disparity)
+        assert len(torch.stack(seen).round().unique(dim=0)) == 14
 
     def test_convention_depth_is_focal_length_times_baseline_over_disparity(self, root):
         """35 mm over 32 mm of 960 pixels is a focal length of 1050 px; the cameras are one unit apart."""
@@ -71,45 +68,36 @@ class TestFlyingThings3D(BaseTester):
         disparity = np.full((12, 20), 8, np.float32)
         disparity[3, 4] = 0
         write_pfm(tmp_path / "disparity/TRAIN/A/0000/left/0006.pfm", disparity)
-        assert FlyingThings3D(tmp_path, subsets="A")[0]["depth"][0, 3, 4] == torch.inf
-        far = FlyingThings3D(tmp_path, subsets="A", disparity_range=(0, 10))[0]
+        assert FlyingThings3D(tmp_path)[0]["depth"][0, 3, 4] == torch.inf
+        far = FlyingThings3D(tmp_path, disparity_range=(0, 10))[0]
         assert far["depth"][0, 3, 4] == 0
         assert far["mask"].all()
 
-    @pytest.mark.parametrize("frames", ["cleanpass", "finalpass"])
-    def test_feature_webp_frames_are_found_where_they_are_unpacked(self, tmp_path, frames):
-        write_flying_things(tmp_path, {"TRAIN/A": 1}, frames=f"frames_{frames}_webp", suffix=".webp")
-        sample = FlyingThings3D(tmp_path, subsets="A", frames=frames)[0]
+    def test_feature_webp_frames_are_found_where_they_are_unpacked(self, tmp_path):
+        write_flying_things(tmp_path, {"TRAIN/A": 1}, frames="frames_cleanpass_webp", suffix=".webp")
+        sample = FlyingThings3D(tmp_path)[0]
         self.assert_close(sample["image"][0], 8 * 1050 / sample["depth"][0] / 255)
 
     def test_exception_missing_data_say_what_to_download(self, tmp_path):
-        message = r"download 'RGB images \(finalpass\)'.* and 'Disparity' .* https://lmb.*finalpass/TRAIN/A/0000/left"
+        message = r"download 'RGB images \(cleanpass\)'.* and 'Disparity' .* https://lmb.*cleanpass/TRAIN/A/0000/left"
         with pytest.raises(FileNotFoundError, match=message):
-            FlyingThings3D(tmp_path, frames="finalpass")
+            FlyingThings3D(tmp_path)
 
     def test_exception_missing_parts_are_named(self, tmp_path):
         write_flying_things(tmp_path, {"TRAIN/A": 1})
-        with pytest.raises(FileNotFoundError, match=r"has no TRAIN/B: unpack the whole archive, or .* subsets="):
-            FlyingThings3D(tmp_path)
-        (tmp_path / "frames_cleanpass/TRAIN/B").mkdir()
-        with pytest.raises(FileNotFoundError, match=r"no left frames \*\.png of TRAIN B"):
-            FlyingThings3D(tmp_path, subsets="B")
+        with pytest.raises(FileNotFoundError, match=r"no left frames \*\.png of TEST"):
+            FlyingThings3D(tmp_path, "test")
 
     def test_exception_a_frame_without_disparity_is_found_at_once(self, tmp_path):
         write_flying_things(tmp_path, {"TRAIN/A": 2})
         (tmp_path / "disparity/TRAIN/A/0001/left/0006.pfm").unlink()
         with pytest.raises(ValueError, match=r"1 of 4 frames have no disparity, the first is TRAIN/A/0001/left/0006: "):
-            FlyingThings3D(tmp_path, subsets="A")
-        assert len(FlyingThings3D(tmp_path, subsets="A", view="right")) == 4
+            FlyingThings3D(tmp_path)
 
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
             ({"split": "val"}, "split must be one of 'train', 'test', got 'val'"),
-            ({"frames": "clean"}, "frames must be one of"),
-            ({"view": "up"}, "view must be one of"),
-            ({"subsets": "AD"}, "subsets must be some of the letters of 'ABC', got 'AD'"),
-            ({"subsets": ""}, "subsets must be"),
             ({"baseline_m": 0.0}, "baseline_m must be positive"),
             ({"disparity_range": (5, 5)}, "0 <= far < near"),
             ({"disparity_range": (-1, 5)}, "0 <= far < near"),

@@ -45,7 +45,7 @@ def data(tmp_path_factory):
         DeadLeaves(3, 40, 48, num_leaves=60),
         PhotographicLeaves(3, 40, 48),
         PhotoCollages(photographs_in(root / "frames_cleanpass"), 3, 40, 48),
-        FlyingThings3D(root, subsets="A"),
+        FlyingThings3D(root),
         NYUDepthV2(root, "all"),
         RGBDFolder(root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **things),
         TUMSequence(root / "tum"),

@@ -35,12 +35,6 @@ class TestSUNRGBD(BaseTester):
             self.assert_close(sample["depth"], torch.full((1, 4, 6), metres))
             assert (~sample["mask"]).nonzero().tolist() == [[0, 1, 2]]
 
-    def test_feature_raw_depth_is_another_folder(self, tmp_path):
-        write(tmp_path, "a", 1000)
-        write(tmp_path, "a", 2000, "depth")
-        (sample,) = SUNRGBD(tmp_path, raw=True)
-        self.assert_close(sample["depth"].unique(), torch.tensor([2.0]))
-
     def test_exception(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="there is no folder"):
             SUNRGBD(tmp_path / "a")

@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_tidy.cli.app.capture import Result
 from kornia_tidy.figures.depth import depth_bar
 from kornia_tidy.figures.explained import MOST_ROWS, draw_masks_and_psfs
-from kornia_tidy.figures.style import DEPTH_COLORS, require_matplotlib
+from kornia_tidy.figures.style import DEPTH_COLORS, new_figure
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 if TYPE_CHECKING:
@@ -66,11 +66,10 @@ def masks_and_psfs(result: Result) -> Picture:
 
 def _figure(width: float, height: float, dots_per_inch: int) -> Figure:
     """Return a figure of inches that draws itself into memory."""
-    require_matplotlib()
+    figure = new_figure(width, height, layout=None)
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
-    from matplotlib.figure import Figure  # noqa: PLC0415
 
-    figure = Figure(figsize=(width, height), dpi=dots_per_inch, facecolor="white")
+    figure.set_dpi(dots_per_inch)
     FigureCanvasAgg(figure)
     return figure
 
