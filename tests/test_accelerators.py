@@ -10,8 +10,6 @@ import torch
 from torch import nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.optics import SYSTEMS
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import pupil_field
 from kornia_tidy.render.compositing import gather
 from tests.base import BaseTester
@@ -73,18 +71,6 @@ class TestCaptures(AcceleratorTester):
     def test_feature_paper_agrees_with_the_cpu(self):
         self.assert_agrees(TiDyOptics(fidelity="paper", sensor=None), *scene())
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", list(SYSTEMS))
-    def test_feature_published_systems_agree_with_the_cpu(self, name):
-        fidelity = replace(fidelity_of("draft"), window=9)
-        optics = TiDyOptics.from_preset(
-            name, fidelity=fidelity, sensor=None, generator=torch.Generator().manual_seed(0)
-        )
-        image, depth = scene(1, 20)
-        lo, hi = optics.camera.defocus_range
-        depth = optics.camera.depth(lo + (hi - lo) * (depth - depth.min()) / (depth.max() - depth.min()) * 0.99)
-        self.assert_agrees(optics, image, depth)
-
     @pytest.mark.parametrize("border", ["reflect", "replicate", "zero", "circular", "valid"])
     def test_feature_borders_and_stray_light_agree_with_the_cpu(self, border):
         fidelity = fidelity_of("balanced", stray_light="veil")
@@ -99,19 +85,6 @@ class TestCaptures(AcceleratorTester):
         self.assert_close(fixed(image, depth), expected, rtol=0, atol=ROUNDING)
         self.assert_agrees(fixed, image, depth)
         self.assert_agrees(optics.with_fixed_layers(depth), image, depth)
-
-    def test_feature_measured_psfs_grey_images_and_no_gradients(self):
-        optics = TiDyOptics(fidelity=fidelity_of("balanced"), sensor=None)
-        image, depth = scene()
-        seen = optics.with_bank(PSFBank.from_measured(torch.rand(3, 3, 9, 9), torch.tensor([-20.0, 0.0, 20.0])))
-        grey = scene(channels=1)
-        with torch.no_grad():
-            expected = [seen(image, depth), optics(*grey), optics(image[0], depth[0])]
-            with SimulatedDevice() as device:
-                seen, optics, image, depth = device.put(seen), device.put(optics), device.put(image), device.put(depth)
-                found = [seen(image, depth), optics(*map(device.put, grey)), optics(image[0], depth[0])]
-        for one, other in zip(found, expected, strict=True):
-            self.assert_close(on_cpu(one), other, rtol=0, atol=ROUNDING)
 
     def test_feature_noise_is_drawn_on_the_device(self):
         optics = TiDyOptics(fidelity=fidelity_of("balanced"), sensor=SensorNoise(0.01))
@@ -128,13 +101,6 @@ class TestCaptures(AcceleratorTester):
 
 class TestWithoutFloat64(AcceleratorTester):
     """As on Apple's mps: every tensor in double precision is refused by the device."""
-
-    @pytest.mark.parametrize("border", ["reflect", "zero"])
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-    def test_feature_captures_agree_with_the_cpu(self, compositing, border):
-        fidelity = fidelity_of("balanced", stray_light="veil")
-        optics = TiDyOptics(fidelity=fidelity, compositing=compositing, border=border, sensor=None)
-        self.assert_agrees(optics, *scene(1), float64=False)
 
     def test_feature_reference_computes_in_float32(self):
         image, depth = scene(1, 24)

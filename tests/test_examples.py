@@ -203,18 +203,6 @@ class TestMotionBlur(BaseTester):
         assert picture(tmp_path / "motion_blur.png").float().std() > 20
 
 
-@pytest.mark.parametrize("example", ["four_lenses"], indirect=True)
-class TestFourLenses(BaseTester):
-    @pytest.mark.slow
-    def test_feature_good_lenses_are_good_in_their_corner(self, example, tmp_path):
-        seen = example.main(["--size", "64", "--fidelity", "draft", "--output", str(tmp_path)])
-        assert list(seen) == list(example.LENSES)
-        good, single, phone = seen["double-gauss-50mm"], seen["single-50mm"], seen["phone-5.5mm"]
-        assert 3 * good.error < single.error < phone.error
-        assert phone.light < 0.7 < good.light
-        assert picture(tmp_path / "four_lenses.png").float().std() > 20
-
-
 @pytest.mark.parametrize("example", ["plain_training_loop"], indirect=True)
 class TestPlainTrainingLoop(BaseTester):
     @pytest.mark.takes_seconds

@@ -39,9 +39,6 @@ def load(name):
 
 
 gallery, api_pages, flowchart = load("gallery"), load("api_pages"), load("flowchart")
-CHARTS = re.findall(
-    r"```mermaid\n(.*?)```", (SITE.parent / "architecture.md").read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
-)
 
 
 @pytest.fixture
@@ -124,24 +121,3 @@ class TestApiPages(BaseTester):
         assert {name: places[name] for name in public if len(places[name]) != 1} == {}
         assert {name: pages for name, pages in places.items() if len(pages) > 1} == {}
         assert [name for name in homes if len(places[name]) != 1] == []
-
-
-class TestFlowChart(BaseTester):
-    @pytest.mark.parametrize("text", CHARTS)
-    def test_feature_boxes_do_not_overlap_and_arrows_go_down(self, text):
-        svg = flowchart.draw_chart(text)
-        boxes = [[float(value) for value in re.findall(r'"([\d.-]+)"', box)] for box in re.findall(r"<rect[^>]*>", svg)]
-        chart = flowchart.read_chart(text)
-        assert len(boxes) == len(chart.lines)
-        for place, (x, y, width, height, _) in enumerate(boxes):
-            for other_x, other_y, other_width, other_height, _ in boxes[:place]:
-                apart = (
-                    x - other_x - other_width,
-                    other_x - x - width,
-                    y - other_y - other_height,
-                    other_y - y - height,
-                )
-                assert max(apart) > 10
-        ends = [re.findall(r"[\d.-]+", path) for path in re.findall(r'<path d="([^"]*)"', svg)]
-        assert len(ends) == len(chart.arrows)
-        assert all(float(end[-1]) > float(end[1]) for end in ends)

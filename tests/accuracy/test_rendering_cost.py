@@ -1,27 +1,20 @@
 from __future__ import annotations
 
 import math
-import time
-from itertools import product
-from pathlib import Path
 
 import pytest
-import scipy.stats
 import torch
 from torch.autograd import forward_ad
 from torch.utils.flop_counter import FlopCounterMode
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.accuracy.costs import bank_work, rendering_work, window_side
-from kornia_tidy.accuracy.planner import Planner
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.overlap_ops import SOURCE
 from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.dispatch import choose
 from kornia_tidy.render.scene import layered_scene
-from tests.base import BaseTester, needs_data
-from tests.capture_memory import predicted_over_used
-from tests.scenes import load_scene
+from tests.base import BaseTester
 
 NODES = tuple(float(psi) for psi in range(-20, 21, 2))
 COMPOSITING = ("gather", "scatter", "occlusion")
@@ -90,36 +83,3 @@ class TestRenderingWork(BaseTester):
         windows = math.ceil(height / tile) * math.ceil(width / tile)
         more = (two.operations - one.operations) / transform_operations(one.window, one.window)
         assert windows + 1 <= more < 1.5 * (windows + 1)
-
-
-class TestCost(BaseTester):
-    @needs_data
-    @pytest.mark.slow
-    def test_feature_what_is_predicted_cheaper_is_faster(self):
-        """Rank correlation of operations and measured time over candidates from the cheapest to the dearest."""
-        optics = TiDyOptics(PixelwiseMask(2), sensor=None, fidelity=Fidelity(window=9), color_space="linear")
-        scene = load_scene("aloe")
-        image, depth = scene.image[None, :, :512, :512], scene.depth[None, :, :512, :512]
-        planned = Planner(optics, 3).scene(optics.camera.defocus(depth), image)
-        fidelities = [
-            Fidelity(layers=layers, layer_spacing=spacing, window=window)
-            for layers, spacing, window in product(("nearest", "linear"), (8.0, 2.0), (9, 33, 85, 129))
-        ]
-        cameras = [optics.with_fidelity(fidelity) for fidelity in fidelities]
-        times = [[] for _ in fidelities]
-        for _ in range(4):  # of all in turn: a machine that is busy for a while slows all down
-            for camera, taken in zip(cameras, times, strict=True):
-                start = time.process_time()
-                with torch.no_grad():
-                    camera(image, depth)
-                taken.append(time.process_time() - start)
-        predicted, measured = [planned.operations(each) for each in fidelities], [min(taken) for taken in times]
-        assert scipy.stats.spearmanr(predicted, measured).statistic > 0.9
-
-    @pytest.mark.slow
-    @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the peak of memory is read from Linux's /proc")
-    @pytest.mark.parametrize("compositing", ["gather", "occlusion"])
-    @pytest.mark.parametrize(("side", "window"), [(1024, 23), (768, 65)])
-    def test_feature_memory_is_what_the_process_takes(self, side, window, compositing):
-        # Libraries need memory of their own, which differs from machine to machine.
-        assert 0.7 < predicted_over_used(side, window, compositing) < 1.8

@@ -1,88 +1,14 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import lru_cache
-from typing import Any
-
-import kornia.augmentation as K
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
-from kornia_tidy.augmentation import OpticsPipeline, RandomDepthBlur, RandomTiDyOptics, depth_blur
+from kornia_tidy.augmentation import RandomDepthBlur, depth_blur
 from tests.base import BaseTester
-from tests.camera.pipeline_samples import Scenes, camera, scene
-
-LOADERS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]  # it imports all again
 
 # Python 3.12 and later: every process that uses torch has threads, and fork says so.
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-
-
-def pipeline() -> OpticsPipeline:
-    torch.manual_seed(11)
-    optics = RandomTiDyOptics(camera(), exposure=(0.5, 1.0), focus_distance=(0.5, 0.8), noise_level=(0.01, 0.1), p=0.7)
-    return OpticsPipeline(K.RandomCrop((40, 48)), optics, K.ColorJiggle(0.2, 0.2, p=0.5))
-
-
-@lru_cache
-def load(workers: int, context: str | None) -> list[dict[str, Any]]:
-    chain = pipeline()
-    torch.manual_seed(5)
-    loader = DataLoader(
-        Scenes({"seeded": chain.as_transform(seed=3), "unseeded": chain.as_transform()}),
-        batch_size=2,
-        num_workers=workers,
-        multiprocessing_context=context,
-        timeout=120 * bool(workers),
-    )
-    return list(loader)
-
-
-def entries(batches: list[dict[str, Any]], transform: str, name: str) -> torch.Tensor:
-    return torch.cat([batch[transform][name] for batch in batches])
-
-
-class TestPipelineTransform(BaseTester):
-    @pytest.mark.parametrize(("workers", "context"), LOADERS)
-    def test_feature_an_item_is_the_same_whoever_loads_it(self, workers, context):
-        """Against a plain loop in this process, in reverse order."""
-        data = Scenes({"seeded": pipeline().as_transform(seed=3)})
-        items = [data[index]["seeded"] for index in (3, 2, 1, 0)]
-        for name in ("image", "depth", "all_in_focus"):
-            expected = torch.stack([item[name] for item in items]).flip(0)
-            assert torch.equal(entries(load(workers, context), "seeded", name), expected)
-
-    @pytest.mark.parametrize(("workers", "context"), LOADERS)
-    def test_feature_nothing_carries_gradients(self, workers, context):
-        assert not entries(load(workers, context), "unseeded", "image").requires_grad
-
-    def test_feature_the_global_generator_is_left_alone(self):
-        data = Scenes({"seeded": pipeline().as_transform(seed=3)})
-        before = torch.get_rng_state()
-        data[0]
-        assert not torch.equal(data[0]["seeded"]["image"], data[1]["seeded"]["image"])
-        assert torch.equal(torch.get_rng_state(), before)
-
-    @pytest.mark.parametrize("seed", [None, 3])
-    def test_cardinality(self, seed):
-        """Single samples, also such as have a batch axis of one, keep their rank and get the size of the crop."""
-        transform, (image, depth) = pipeline().as_transform(seed=seed), scene(1, height=64, width=64)
-        for lead, sample in (((), (image[0], depth[0])), ((1,), (image, depth))):
-            out = transform({"image": sample[0], "depth": sample[1], "index": 2})
-            assert out["image"].shape == out["all_in_focus"].shape == (*lead, 3, 40, 48)
-            assert out["depth"].shape == (*lead, 1, 40, 48)
-
-    def test_exception_a_seed_without_the_key(self):
-        with pytest.raises(KeyError, match=r"tells items apart by sample\['index'\]"):
-            pipeline().as_transform(seed=3)({"image": torch.rand(3, 64, 64), "depth": torch.ones(1, 64, 64)})
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _forget_batches() -> Iterator[None]:
-    yield
-    load.cache_clear()
 
 
 LENS = {"focus_distance": (0.6, 0.6), "f_number": (4.0, 4.0), "p": 1.0}

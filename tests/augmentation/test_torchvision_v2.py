@@ -58,28 +58,6 @@ class TestDepth(BaseTester):
         values = plain(out["depth"])
         assert torch.isin(values, torch.cat([plain(given["depth"]).flatten(), torch.zeros(1)])).all()
 
-    @pytest.mark.parametrize(
-        "transform",
-        [
-            v2.ColorJitter(0.5, 0.5, 0.5, 0.2),
-            v2.GaussianBlur(5),
-            v2.RandomInvert(1.0),
-            v2.RandomSolarize(0.3, 1.0),
-            v2.RandomPhotometricDistort(p=1.0),
-            v2.Normalize([0.5] * 3, [0.2] * 3),
-            v2.GaussianNoise(),
-            v2.ToDtype(torch.float16, scale=True),
-        ],
-        ids=lambda transform: type(transform).__name__,
-    )
-    def test_feature_photometric_transforms_leave_it_alone(self, transform):
-        given = sample()
-        out = transform(given)
-        assert isinstance(out["depth"], Depth)
-        assert torch.equal(plain(out["depth"]), plain(given["depth"]))
-        assert out["depth"].dtype == torch.float32
-        assert not torch.equal(plain(out["image"]), plain(given["image"]))
-
 
 class TestOpticsTransform(BaseTester):
     @pytest.mark.parametrize("kind", [torch.uint8, torch.float16, torch.bfloat16, torch.float32, torch.float64])

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.func import functional_call, grad, jvp, vmap
 
-from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.occlusion_ops import SOURCE
 from kornia_tidy.render.compositing import COMPOSITING
@@ -107,10 +107,6 @@ class TestSecondDerivatives(BaseTester):
     def test_feature_at_every_border(self, compositing, border):
         self.check(camera(compositing, border=border), "square", *scene())
 
-    def test_feature_of_dwell_times_too(self):
-        switching = Switching(8e-3, between="linear", samples=2, dwell=LearnableDwellTimes((1, 2)))
-        self.check(camera("occlusion", modulator=switching), "linear", *scene())
-
     def check(self, optics: TiDyOptics, loss: str, image: Tensor, depth: Tensor) -> None:
         masks = masks_of(optics)
         target = torch.rand(1, generator=torch.Generator().manual_seed(1)).double()
@@ -199,20 +195,6 @@ class TestTransformsOfTorch(BaseTester):
             dual = {name: forward_ad.make_dual(value, way[name]) for name, value in masks.items()}
             slope = forward_ad.unpack_dual(loss(dual)).tangent
         self.assert_close(slope, expected, rtol=1e-9, atol=0)
-
-    def test_feature_forward_over_reverse_is_reverse_over_reverse(self, compositing):
-        optics, (image, depth) = camera(compositing), scene()
-        masks = masks_of(optics)
-        way = ways(masks)
-
-        def loss(masks):
-            return functional_call(optics, masks, (image, depth)).square().mean()
-
-        forward = jvp(grad(loss), (masks,), (way,))[1]["masks.phase"]
-        leaves = masks_of(optics)
-        first = slopes(loss, leaves, again=True)
-        (twice,) = torch.autograd.grad((first["masks.phase"] * way["masks.phase"]).sum(), list(leaves.values()))
-        self.assert_close(forward, twice, rtol=0, atol=1e-9 * float(twice.abs().max()))
 
     def test_feature_vmap_is_a_loop(self, compositing):
         """Over masks, over scenes, and over the gradients of scenes."""

@@ -45,20 +45,6 @@ def scene(height: int = 72, width: int = 100, seed: int = 0) -> tuple[torch.Tens
     return torch.rand(1, 1, height, width, generator=generator), 1 / inverse
 
 
-def textured(number: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Texture that is bright where things are near."""
-    light, depth = scene(96, 120, seed=100 + number)
-    return 0.4 * light + 0.6 * ((1 / depth - 0.2) / 3), depth
-
-
-def points_of_light(number: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of full scale in the dark, the last beside the corner."""
-    light, depth = scene(96, 120, seed=100 + number)
-    points = (light > 0.99).to(light)
-    points[..., -3:, -6:] = 1
-    return points, depth
-
-
 def place(optics: TiDyOptics, image: torch.Tensor, pixel: tuple[int, int]) -> tuple[float, float]:
     """Where a pixel lies, from the axis."""
     return tuple(
@@ -107,38 +93,6 @@ class TestLensCaptures(BaseTester):
                 slice(max(0, 8 - p), min(17, side - p + 8)) for p, side in zip((y, x), (72, 100), strict=True)
             )
             assert float((seen[0] - psf)[:, rows, columns].norm() / psf.norm()) < 0.02
-
-    @pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in range(3, 20))])
-    @torch.no_grad()
-    def test_feature_scenes_against_the_psf_of_each_pixel(self, number):
-        """Texture that goes with depth, and point lights up to the corner; by the default tolerance."""
-        compositing, texture = ("gather", "scatter", "occlusion")[number % 3], number % 2 == 0
-        image, depth = textured(number) if texture else points_of_light(number)
-        settings = SETTINGS.replace(window=9, field_tolerance=Fidelity().field_tolerance)
-        lens = ("single-50mm", "double-gauss-50mm")[number % 5 == 4]
-        lens = Lens.named(lens, 17.6, 0.595)
-        parts = {"fidelity": settings, "lens": lens, "camera": lens.camera(8e-6), "center": (500.0, 570.0)}
-        optics = camera(compositing, "zero", **parts)
-        seen, psi, nodes = optics(image, depth)[0, 0], optics.defocus(depth), torch.tensor(optics.defocus_nodes)
-        generator = torch.Generator().manual_seed(number)
-        corner = [(seen.shape[0] - 4, seen.shape[1] - 5), (5, 6)]
-        others = [tuple(int(torch.randint(n, (1,), generator=generator)) for n in seen.shape) for _ in range(2)]
-        for y, x in corner[:1] if compositing == "scatter" else corner + others:
-            if compositing != "scatter":
-                bank = optics.psf_bank(field=[place(optics, image, (y, x))])
-                own = PSFBank(bank.psfs[0], bank.defocus, bank.energy[0])
-                expected = render(image, psi, own, compositing=compositing, border="zero")[0, 0, y, x]
-                expected = expected * bank.light[0].mean() if compositing == "occlusion" else expected
-            else:
-                rows, columns = (range(p - 4, min(p + 5, side)) for p, side in zip((y, x), seen.shape, strict=True))
-                sources = [(a, b) for a in rows for b in columns if texture or image[0, 0, a, b] == 1]
-                bank, expected = optics.psf_bank(field=[place(optics, image, at) for at in sources]), torch.zeros(())
-                for psfs, (a, b) in zip(bank.psfs[:, :, 0], sources, strict=True):
-                    below = int((nodes <= psi[0, 0, a, b]).sum().clamp(1, len(nodes) - 1)) - 1
-                    share = (psi[0, 0, a, b] - nodes[below]) / (nodes[below + 1] - nodes[below])
-                    psf = torch.lerp(psfs[below], psfs[below + 1], share)
-                    expected = expected + image[0, 0, a, b] * psf[y - a + 4, x - b + 4]
-            assert abs(float(expected - seen[y, x])) < 1e-3
 
     @pytest.mark.parametrize("compositing", ["gather", "scatter"])
     @torch.no_grad()
@@ -278,31 +232,6 @@ class TestLensCaptures(BaseTester):
         axis = optics.psf_bank(field=[(0.0, 0.0)])
         same = render(image, optics.defocus(depth), PSFBank(axis.psfs[0], axis.defocus, axis.energy[0]))
         self.assert_close(optics(image, depth), same, rtol=0, atol=1e-3)
-
-    @pytest.mark.parametrize(
-        ("compositing", "mask_shift"), [("gather", 0.0), ("scatter", 0.0), ("occlusion", 0.0), ("gather", 22.0)]
-    )
-    def test_gradcheck_along_a_direction(self, compositing, mask_shift):
-        """To masks, light and depth, against differences of captures; behind what hides the last two are of cells."""
-        settings = SETTINGS.replace(double=True, window=9, layer_spacing=20.0)
-        settings = settings.replace(field_tolerance=1e-4) if compositing == "occlusion" else settings
-        optics = camera(compositing, "zero", fidelity=settings, **off_stop(mask_shift))
-        (image, depth), generator = scene(20, 24), torch.Generator().manual_seed(5)
-        start = image.double(), depth.double(), optics.masks.phase.detach().double()
-        ways = [torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in start]
-        ways[1] *= 1e-3
-        weight = torch.rand(1, 1, 20, 24, generator=generator, dtype=torch.float64)
-
-        def capture(*given: torch.Tensor) -> torch.Tensor:
-            return (torch.func.functional_call(optics, {"masks.phase": given[2]}, given[:2]) * weight).sum()
-
-        leaves = [x.clone().requires_grad_() for x in start]
-        slopes = torch.autograd.grad(capture(*leaves), leaves)
-        for i, (slope, way) in enumerate(zip(slopes, ways, strict=True)):
-            step = 1e-5
-            ends = [capture(*(x + sign * step * way if j == i else x for j, x in enumerate(start))) for sign in (1, -1)]
-            measured = (ends[0] - ends[1]) / (2 * step)
-            assert abs(float((slope * way).sum() / measured) - 1) < 1e-3, i
 
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize("compositing", ["gather", "occlusion"])

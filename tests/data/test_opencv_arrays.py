@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from kornia_tidy.arrays import image_tensor
-from kornia_tidy.data import read_image, to_opencv, write_image
+from kornia_tidy.data import to_opencv
 from tests.base import BaseTester
 
 
@@ -32,16 +31,6 @@ class TestOpenCVArrays(BaseTester):
     )
     def test_property_there_and_back_is_the_same(self, picture):
         assert np.array_equal(to_opencv(from_opencv(picture), picture.dtype), picture)
-
-    @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-    def test_feature_agrees_with_files(self, tmp_path, kind):
-        """More rows than are converted at a time."""
-        picture = np.random.default_rng(0).integers(0, np.iinfo(kind).max, (300, 20, 3), kind, endpoint=True)
-        cv2.imwrite(str(tmp_path / "a.png"), picture)
-        image = from_opencv(picture)
-        assert torch.equal(image, read_image(tmp_path / "a.png"))
-        write_image(tmp_path / "b.png", image, 8 * picture.itemsize)
-        assert np.array_equal(cv2.imread(str(tmp_path / "b.png"), cv2.IMREAD_UNCHANGED), picture)
 
     def test_feature_red_comes_first(self):
         picture = np.array([[[10, 20, 30]]], np.uint8)

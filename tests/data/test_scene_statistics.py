@@ -106,8 +106,3 @@ class TestDepthWeights(BaseTester):
     def test_feature_without_a_distribution_equally_spaced_nodes_count_alike(self):
         weights = scenes().depth_weights(torch.linspace(-3, 3, 4))
         assert weights.tolist() == pytest.approx([1 / 6, 1 / 3, 1 / 3, 1 / 6])
-
-    def test_dynamo(self):
-        compiled = torch.compile(PHOTOGRAPHS.depth_weights, fullgraph=True, backend="eager")
-        nodes = torch.linspace(-20, 20, 21)
-        self.assert_close(compiled(nodes), PHOTOGRAPHS.depth_weights(nodes), rtol=0, atol=0)

@@ -50,13 +50,6 @@ class TestRestorations(BaseTester):
         assert len(images) == (1 + len(NOISE_FACTORS)) * len(BILATERAL)
         assert {tuple(image.shape) for image in images.values()} == {(1, 3, 32, 32)}
 
-    def test_feature_filters_lessen_the_noise_of_a_flat_grey(self):
-        noise = 0.05 * torch.randn(1, 3, 48, 48, generator=torch.Generator().manual_seed(0))
-        images = restorations(0.3 + noise, WienerFilter(gaussians([0.5, 0.5]), 0.05, PHOTOGRAPHS, (48, 48)))
-        spread = {name: float(image.std()) for name, image in images.items()}
-        assert spread["Wiener x 0.8"] < 0.5 * spread["capture"]
-        assert spread["capture, bilateral 0.28"] < 0.5 * spread["capture"]
-
 
 class TestRestoredByDepth(BaseTester):
     def test_feature_each_region_is_restored_by_its_own_depth(self):
@@ -86,11 +79,3 @@ class TestDepthLikelihood(BaseTester):
             found.append([float(mean_depth(each)[32:64, 32:64].mean()) for each in probabilities.values()])
         for far, middle, near in zip(*found, strict=True):
             assert far + 0.05 < middle < near - 0.05
-
-    def test_feature_without_texture_it_says_what_scenes_are_like(self):
-        bank = gaussians([0.5 + 0.2 * depth for depth in range(11)])
-        shares = PHOTOGRAPHS.depth_weights(bank.defocus)
-        expected = float((shares * torch.linspace(0, 1, 11)).sum())
-        same = PSFBank(bank.psfs[:1].expand(11, -1, -1, -1).contiguous(), bank.defocus, bank.energy)
-        for probability in DepthLikelihood(same, 0.01, PHOTOGRAPHS, (32, 32))(texture(32)).values():
-            self.assert_close(mean_depth(probability), torch.full((32, 32), expected))

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-import tempfile
-from pathlib import Path
 
 import hypothesis.strategies as st
 import torch
 from hypothesis import given, settings
-from safetensors.torch import save_file
 from torch import Tensor
 
-from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.tensor_files import read_tensors
+from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, TiDyOptics
 from tests.base import BaseTester
 
 FEW = settings(max_examples=25, derandomize=True)
@@ -116,45 +112,9 @@ class TestLaws(BaseTester):
         self.assert_close(*captures, atol=1e-6, rtol=0)
 
     @FEW
-    @given(cameras(), scenes(), st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6))
-    def test_feature_copies_of_a_mask_are_the_mask(self, optics, scene, times):
-        """Of masks of up to 943 waves, whatever the times that each is shown."""
-        one = 1e-3 * torch.rand(1, 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        options = {"sensor": None, "color_space": "linear", "fidelity": optics.fidelity}
-        options |= {"compositing": optics.compositing, "border": optics.border}
-        copies = PixelwiseMask(initial=one.expand(len(times), -1, -1).clone())
-        shown = TiDyOptics(copies, modulator=DwellTimes(times), **options).double()
-        alone = TiDyOptics(PixelwiseMask(initial=one), **options).double()
-        self.assert_close(taken(shown, *scene), taken(alone, *scene), atol=1e-9, rtol=0)
-
-    @FEW
     @given(cameras(), scenes(), st.integers(-1000, 1000))
     def test_feature_whole_waves_over_the_whole_mask_change_nothing(self, optics, scene, turns):
         before = taken(optics.double(), *scene)
         with torch.no_grad():
             optics.masks.phase += 2 * math.pi * turns
         self.assert_close(taken(optics, *scene), before, atol=1e-9, rtol=0)
-
-    @FEW
-    @given(cameras(), scenes(), st.integers(0, 2**31))
-    def test_feature_a_replayed_capture_is_the_same(self, optics, scene, seed):
-        optics.sensor = SensorNoise(0.01, full_well=500.0)
-        params = optics.draw(scene[0], generator=torch.Generator().manual_seed(seed))
-        assert torch.equal(taken(optics, *scene, params=params), taken(optics, *scene, params=params))
-        drawn = taken(optics, *scene, generator=torch.Generator().manual_seed(seed))
-        assert torch.equal(drawn, taken(optics, *scene, params=params))
-
-    @FEW
-    @given(cameras(), scenes())
-    def test_feature_a_saved_camera_takes_the_same_picture(self, optics, scene):
-        before = taken(optics, *scene)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "camera.safetensors"
-            save_file(optics.state_dict(), path)
-            state, _ = read_tensors(path, "camera")
-        other = TiDyOptics(
-            PixelwiseMask(len(optics.masks.phase), optics.masks.phase.shape[-1], initial="flat"), sensor=None,
-            color_space="linear", fidelity=optics.fidelity, compositing=optics.compositing, border=optics.border,
-        )  # fmt: skip
-        other.load_state_dict(state)
-        assert torch.equal(taken(other, *scene), before)

@@ -1,5 +1,4 @@
 import math
-import pickle
 import re
 
 import pytest
@@ -89,14 +88,6 @@ class TestMaterial(BaseTester):
         nearest = min(rows, key=lambda row: abs(row[0] - 0.53))
         assert nearest[1] == pytest.approx(1.498, abs=5e-4)
         assert NOA61.index(530e-9) - nearest[1] > 0.06
-
-    def test_feature_is_plain_data(self):
-        for material in (*MATERIALS, constant_index(1.5)):
-            copy = pickle.loads(pickle.dumps(material))
-            assert copy == material
-            assert hash(copy) == hash(material)
-            with pytest.raises(AttributeError):
-                material.name = "glass"
 
     @by_name
     @given(st.floats(0.0, 0.99), st.floats(0.001, 1.0))

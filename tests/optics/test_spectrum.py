@@ -1,5 +1,4 @@
 import math
-import pickle
 import re
 import subprocess
 import sys
@@ -70,19 +69,6 @@ class TestSpectrum(BaseTester):
         assert REFERENCE_WAVELENGTH == 530e-9
         assert Spectrum.monochrome() == Spectrum((530e-9,), ((1.0,),))
         assert Spectrum.monochrome(633e-9).wavelengths == (633e-9,)
-
-    def test_feature_lists_and_arrays_make_the_same_spectrum(self):
-        spectrum = Spectrum(np.array([500e-9, 600e-9]), [[1, 2], np.array([3, 4])])
-        same = Spectrum((500e-9, 600e-9), ((1.0, 2.0), (3.0, 4.0)))
-        assert spectrum == same
-        assert hash(spectrum) == hash(same)
-        assert {type(value) for value in (*spectrum.wavelengths, *spectrum.weights[0])} == {float}
-
-    def test_feature_is_plain_data(self):
-        spectrum = Spectrum.rgb()
-        assert pickle.loads(pickle.dumps(spectrum)) == spectrum
-        with pytest.raises(AttributeError):
-            spectrum.wavelengths = (500e-9,)
 
     @given(
         st.integers(1, 6).flatmap(

@@ -49,17 +49,6 @@ class TestModelCard(BaseTester):
         assert rows["other"] == ["2", "5"]
         assert rows["score"] == [r"desk \| lamp", "b"]
 
-    @pytest.mark.parametrize(
-        ("settings", "words"),
-        [
-            ({}, "nothing"),
-            ({"residual": True}, "the capture"),
-            ({"closed_form": True, "inverse": "wiener"}, "the closed form, with the filter 'wiener'"),
-        ],
-    )
-    def test_feature_what_the_network_begins_from(self, settings, words):
-        assert f"| begins from | {words} |" in model_card(untrained(**settings), "t")
-
     @pytest.mark.parametrize(("height", "words"), [(1e-7, "a lens without masks"), (None, "1 learnt phase mask ")])
     def test_feature_masks_are_those_the_camera_has(self, height, words):
         heights = torch.rand(1, 23, 23) * 1e-7 if height is None else torch.full((1, 23, 23), height)
@@ -80,13 +69,6 @@ class TestModelCard(BaseTester):
         assert head[:3] == ["library_name: kornia_tidy", "license: cc-by-nc-4.0", f"pipeline_tag: {tag}"]
         assert head[3] == "tags:"
         assert all(re.fullmatch(r"- [a-z_-]+", line) for line in head[4:])
-
-    def test_feature_painted_scenes_and_depth_have_limits_of_their_own(self):
-        painted = model_card(untrained(task="depth")._replace(run={"data": "dead-leaves"}), "t")
-        other = model_card(untrained(task="edof")._replace(run={"data": "nyu"}), "t")
-        for sentence in ("painted scenes", "without texture"):
-            assert sentence in painted
-            assert sentence not in other
 
     def test_feature_noise_and_certainty_are_those_of_the_training(self):
         run = {"data": "photo-collages", "learn": "network", "noise_range": [0.001, 0.03]}

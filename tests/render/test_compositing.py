@@ -80,17 +80,6 @@ class TestRender(BaseTester):
         coded = render(image, torch.zeros_like(image), one_layer(psf), compositing, correlate=correlate)
         assert divmod(int(coded.argmax()), 13) == expected
 
-    @over_sums
-    def test_convention_an_upper_layer_takes_nearer_pixels(self, compositing, device, dtype):
-        """Layer 0 is black, layer 1 passes light unchanged: only pixels with high defocus are seen."""
-        psfs = torch.zeros(2, 1, 3, 3, device=device, dtype=dtype)
-        psfs[1, 0, 1, 1] = 1
-        bank = Bank(psfs, torch.tensor([-10.0, 10.0], device=device, dtype=dtype))
-        defocus = torch.tensor([-30.0, -10.0, -5.0, 0.0, 10.0, 30.0], device=device, dtype=dtype).view(1, 1, 1, 6)
-        coded = render(torch.ones_like(defocus), defocus, bank, compositing, border="zero")
-        expected = torch.tensor([0, 0, 0.25, 0.5, 1, 1], device=device, dtype=dtype)
-        self.assert_close(coded.flatten(), expected, rtol=0, atol=1e-6)
-
     # Physics
 
     @pytest.mark.parametrize("light", [1.0, 0.7])
@@ -110,14 +99,6 @@ class TestRender(BaseTester):
         coded = render(image, defocus, bank, "scatter", layers=layers, border="circular")
         rtol = 1e-13 if dtype == torch.float64 else 1e-6
         self.assert_close(coded.mean((-2, -1)), image.mean((-2, -1)), rtol=rtol, atol=0)
-
-    @over_compositing
-    def test_property_linear_equals_nearest_on_the_nodes(self, compositing, device, dtype):
-        bank = make_bank(6, 3, 5, dtype=dtype, device=device)
-        image, _ = make_scene(bank)
-        defocus = bank.defocus[torch.randint(6, (2, 1, 9, 12), device=device)]
-        linear, nearest = (render(image, defocus, bank, compositing, layers=mode) for mode in ("linear", "nearest"))
-        self.assert_close(linear, nearest, rtol=0, atol=1e-14 if dtype == torch.float64 else 1e-6)
 
     # What is skipped, shared and shaped
 

@@ -95,11 +95,3 @@ class TestRenderNumerics(BaseTester):
         coded = render(image, defocus, bank, compositing)
         assert coded.dtype == torch.float32
         assert torch.equal(coded, render(image.double(), defocus, bank, compositing).float())
-
-    @over_compositing
-    def test_feature_autocast_changes_nothing(self, compositing, device):
-        bank = make_bank(4, 3, 5, dtype=torch.float32, device=device, light=0.8, veil=True)
-        image, defocus = make_scene(bank)
-        expected = render(image, defocus, bank, compositing)
-        with torch.autocast(device.type, dtype=torch.bfloat16):
-            assert torch.equal(render(image, defocus, bank, compositing), expected)

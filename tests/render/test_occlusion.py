@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, cumulative_weight, lay_over
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import gather, render
+from kornia_tidy.render.compositing import render
 from kornia_tidy.render.layers import layer_weights
 from tests.base import BaseTester
 from tests.render.render_tester import METHODS
 from tests.render.scenes import Bank, make_bank, make_scene, squares
-from tests.rounding import gamma
 
 
 class TestOcclusion(BaseTester):
@@ -35,17 +34,6 @@ class TestOcclusion(BaseTester):
         self.assert_close(lay_over([(light, light, seen)]), light / EPSILON, rtol=1e-6, atol=0)
 
     # Physics
-
-    @pytest.mark.parametrize("method", METHODS)
-    @pytest.mark.parametrize("border", ["reflect", "replicate", "circular", "valid"])
-    def test_property_one_layer_equals_gather(self, method, border, device, dtype):
-        bank = make_bank(4, 3, 7, dtype=dtype, device=device, light=0.8, veil=True)
-        image, _ = make_scene(bank, 2, 37, 30)
-        defocus = bank.defocus[2].expand(1, 1, 37, 30)
-        expected = gather(image, defocus, bank.defocus, bank.psfs, bank.veil, border=border)
-        coded = render(image, defocus, bank, "occlusion", border=border, method=method)
-        # What is seen of the layer is divided by itself and EPSILON; light is at most 1.
-        self.assert_close(coded, expected, rtol=0, atol=EPSILON + 3 * gamma(7 * 7 + 8, dtype))
 
     @pytest.mark.parametrize("method", METHODS)
     @pytest.mark.parametrize("layers", ["nearest", "linear"])

@@ -98,12 +98,6 @@ class TestPieces(BaseTester):
         for own, whole in zip(found, expected, strict=True):
             self.assert_close(own, whole, rtol=0, atol=1e3 * ROUNDING * float(whole.abs().max()))
 
-    @torch.no_grad()
-    def test_feature_one_depth_map_serves_the_batch(self, few):
-        optics, (light, psi) = make_optics(), make_scene()
-        found, expected = both(optics, light, psi[:1], few(optics, light, psi[:1]))
-        self.assert_close(found, expected, rtol=0, atol=ROUNDING)
-
     @given(present=st.lists(st.booleans(), max_size=30), most=st.integers(1, 5))
     def test_property_runs_hold_what_is_present_once(self, present, most):
         runs = runs_of(present, most)

@@ -9,7 +9,6 @@ from torch import nn
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
-from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.reconstruction.trained import build_optics, check_weights, load_trained, load_weights
 from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.training.scenes import Broken, SceneLoader
@@ -87,14 +86,6 @@ class TestTidyTraining(BaseTester):
         module = made(masks=0)
         assert not list(module.optics.parameters())
         assert len(module.configure_optimizers().param_groups) == 1
-
-    def test_feature_the_window_stays_when_masks_change(self):
-        module = TidyTraining(TiDyOptics(PixelwiseMask(1, initial="flat")), nn.Identity())
-        before = module.optics.window
-        assert before < 65
-        state = {**module.state_dict(), "optics.masks.phase": 3 * torch.randn(1, 23, 23)}
-        module.load_state_dict(state)
-        assert module.optics.window == before
 
     @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
     def test_feature_optics_stay_in_float32_and_the_network_has_its_precision(self, precision, tmp_path):
@@ -284,18 +275,6 @@ class TestCheckpoint(BaseTester):
         coded = module.eval().reconstruct(batch()).coded
         # PSFs with and without gradients are computed in two ways, equal to round-off.
         torch.testing.assert_close(system.head(coded), module(coded), rtol=1e-5, atol=1e-5)
-
-    @pytest.mark.parametrize("closed_form", [True, False])
-    def test_feature_a_network_with_a_distribution_of_depth_comes_back(self, closed_form, tmp_path):
-        module = made(depth_classes=6, refocus=2, masks=1, ema=0, closed_form=closed_form)
-        module.head.temperature.fill_(1.5)
-        trainer(tmp_path).fit(module, SceneLoader(DeadLeaves(2, 48, 48), 2))
-        state = {"settings": module.settings.as_dict(), "state_dict": module.state_dict(), "global_step": 2}
-        write_state(tmp_path / "a", state)
-        system = load_trained(tmp_path / "a")
-        coded = torch.rand(1, 3, 48, 48)
-        with torch.no_grad():
-            assert torch.equal(system.head(coded), module.eval()(coded))
 
     def test_feature_weights_go_into_objects_of_ones_own(self, saved):
         module, path = saved

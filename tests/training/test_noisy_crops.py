@@ -101,14 +101,6 @@ class TestNoiseFreeCaptures(BaseTester):
         assert not calls
         assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
 
-    def test_feature_later_changes_of_the_masks_do_not_reach_them(self, tmp_path):
-        optics = camera()
-        captures = NoiseFreeCaptures(Points(), optics, tmp_path)
-        before = captures[0].light
-        with torch.no_grad():
-            optics.masks.phase.add_(torch.randn_like(optics.masks.phase))
-        assert torch.equal(captures[1].light, before)
-
     def test_exception_captures_of_another_camera_or_of_other_scenes(self, tmp_path):
         NoiseFreeCaptures(Points(), camera(), tmp_path, {"seed": 0})
         NoiseFreeCaptures(Points(), camera(sigma=0.3), tmp_path, {"seed": 0})  # the sensor does not matter

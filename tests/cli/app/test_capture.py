@@ -12,8 +12,7 @@ from kornia_tidy.cli.app.capture import known_system, own_camera, take_picture
 from kornia_tidy.cli.app.script import as_python
 from kornia_tidy.cli.app.settings import CAMERAS, Settings
 from kornia_tidy.data import Scene, dead_leaves, read_depth, read_image, write_depth, write_image
-from kornia_tidy.reconstruction.metrics import psnr
-from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.pretrained import PRETRAINED
 from kornia_tidy.reconstruction.tasks import metres
 from tests.base import BaseTester
 
@@ -71,19 +70,6 @@ class TestTakePicture(BaseTester):
         near, far = result.camera.depth_range
         assert float(result.scene.depth.amax()) == pytest.approx(far, rel=1e-6)
         assert near <= float(result.scene.depth.amin()) < 1.3 * near
-
-    def test_feature_a_change_of_noise_does_not_reach_other_settings(self):
-        before = take_picture(Settings(**SMALL)).capture
-        take_picture(Settings(noise=0.05, compositing="scatter", **SMALL))
-        assert torch.equal(take_picture(Settings(**SMALL)).capture, before)
-
-    def test_feature_a_network_is_told_the_noise(self):
-        result = take_picture(Settings(camera="edof-5", noise=0.03, **SMALL))
-        head = load_pretrained("edof-5").head
-        with torch.no_grad():
-            expected, untold = (head(result.capture[None], *noise)[0].clamp(0, 1) for noise in ((0.03,), ()))
-        self.assert_close(result.image, expected, rtol=0, atol=1e-5)
-        assert (untold - expected).abs().mean() > 1e-3
 
     def test_feature_stages_are_told_in_order(self):
         told = []
@@ -159,12 +145,6 @@ class TestBehindALens(BaseTester):
 
 
 class TestResult(BaseTester):
-    def test_feature_psnr_is_that_of_the_metric(self):
-        result = take_picture(Settings(camera="edof-flat", **SMALL))
-        assert result.scores()["capture_psnr"] == pytest.approx(
-            float(psnr(result.capture[None], result.scene.image[None]))
-        )
-
     def test_feature_only_known_depths_count(self, folder):
         result = take_picture(Settings(**SMALL))
         truth, estimate = result.inverse_depth, torch.zeros_like(result.inverse_depth)

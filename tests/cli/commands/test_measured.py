@@ -8,11 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, read_image, read_rgbd, write_depth, write_image
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs, measured_camera
-from kornia_tidy.lab.mask_export import write_heights
 from kornia_tidy.lab.measured import closed_form_system
 from kornia_tidy.lab.raw import RawCapture, RawInfo, develop, simulate_scene
 from kornia_tidy.lab.raw.developed_noise import developed_noise
@@ -23,7 +21,7 @@ from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.coded_datasets import CodedCaptures
 from tests.base import BaseTester
 from tests.cli.commands.test_raw_reconstruct import checkpoint
-from tests.measured import HEIGHTS, measured_noise, measured_psfs, sweep, write_measurements
+from tests.measured import measured_noise, measured_psfs, sweep, write_measurements
 
 PSFS, NOISE = ["--psfs", "bank.safetensors"], ["--noise", "noise.json"]
 MEASURED = [*PSFS, *NOISE]
@@ -96,14 +94,6 @@ class TestRawReconstruct(BaseTester):
         for one_place, several in zip(*found, strict=True):
             self.assert_close(one_place, several, rtol=0, atol=2 / 255)
 
-    def test_feature_a_network_is_told_and_pictures_are_taken_too(self, here):
-        checkpoint(here / "mine.safetensors", task="edof", closed_form=True, **LENS)
-        named = ["raw", "reconstruct", "shot.dng", "--head", "mine.safetensors"]
-        assert main([*named, *MEASURED, "-o", "told"]) == 0
-        assert main([*named, "--noise", "noise.json", "-o", "own"]) == 0
-        assert not torch.equal(read_image("told/shot.png"), read_image("own/shot.png"))
-        assert main(["raw", "reconstruct", "scene.png", *MEASURED, "--linear", "-o", "told"]) == 0
-
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
@@ -134,14 +124,6 @@ class TestCaptures(BaseTester):
         optics = measured_camera("bank.safetensors", sensor=measured_noise().sensor_noise())
         coded = optics(scene.image, scene.depth, generator=torch.Generator().manual_seed(3))
         assert (read_image("coded.png") - coded).abs().max() <= 0.5 / 65535 + 1e-6
-
-    def test_feature_masks_of_a_file(self, here):
-        write_heights("masks.npy", HEIGHTS)
-        coded = ["--noise", "0", "-o", "coded.png", "--bits", "16"]
-        assert main(["simulate", "scene.png", *SCENE, "--masks", "masks.npy", *coded]) == 0
-        scene = read_rgbd("scene.png", "depth.png", scale=0.001)
-        optics = TiDyOptics(PixelwiseMask(initial=HEIGHTS), sensor=SensorNoise(0))
-        assert (read_image("coded.png") - optics(scene.image, scene.depth)).abs().max() <= 0.5 / 65535 + 1e-6
 
     def test_feature_flats_and_points_can_be_calibrated(self, here, capsys):
         flats = []

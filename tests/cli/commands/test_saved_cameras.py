@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import cycle, pairwise, product
+from itertools import cycle, product
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from kornia_tidy.lab.mask_export import read_slm_frames
 from kornia_tidy.masks import PixelwiseMask
 from kornia_tidy.masks.limits import CONSTRAINTS
 from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, StrokeError
-from kornia_tidy.optics import SYSTEMS, Material, circular_aperture, constant_index
+from kornia_tidy.optics import SYSTEMS, Material, constant_index
 from kornia_tidy.psf.camera_settings import read_settings, write_settings
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.state_file import write_state
@@ -136,27 +136,6 @@ class TestMasks(BaseTester):
             assert f"to {high:.1f} nm" in told
             assert "PDMS" in told
             assert "0.3333 0.6667" in told
-
-
-class TestPsf(BaseTester):
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize("number", range(len(LIMITED) // 2))
-    def test_feature_psfs_are_the_camera_s(self, number, tmp_path, capsys):
-        """Each family that learns twice, with the other parts in turn."""
-        (family, constraint), modulator = LIMITED[2 * number + number % 2], list(MODULATORS)[number % len(MODULATORS)]
-        material = list(MATERIALS)[number % len(MATERIALS)]
-        lens = ThinLensCamera(35e-3, 3e-3, 0.8, 6e-6, lens_material=None if number % 2 else MATERIALS["PMMA"])
-        aperture = circular_aperture(46, 0.05, edges="area") if number % 3 else None
-        path, options = tmp_path / "a.safetensors", {"camera": lens, "aperture": aperture}
-        optics = saved(path, family, constraint, modulator, material, **options)
-        assert main(["psf", str(path), "-o", str(tmp_path / "a.png"), "--depths", "0.6"]) == 0
-        psi = lens.defocus(torch.tensor([0.6], dtype=torch.float64)).tolist()
-        psfs = optics.with_fidelity(FIDELITY.replace(stray_light="discard")).psf_bank(defocus=psi).psfs.detach()[0]
-        told = [line.split() for line in capsys.readouterr().out.splitlines() if line.count(" % ") == 2]
-        for row, own in zip(told, psfs, strict=True):
-            held, peak = (float(before) for before, word in pairwise(row) if word == "%")
-            assert held == pytest.approx(100 * float(own.sum()), abs=0.06)
-            assert peak == pytest.approx(100 * float(own.max()), abs=0.006)
 
 
 BANK = PSFBank.from_measured(torch.rand(1, 3, 5, 5), torch.zeros(1))

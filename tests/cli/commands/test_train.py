@@ -164,14 +164,6 @@ class TestEvaluate(BaseTester):
         self.assert_close(error[inside], expected[inside], rtol=0, atol=4.1 / 255)
         assert not list(out.glob("scene_0001*"))
 
-    def test_feature_it_repeats(self, run, tmp_path):
-        texts = []
-        for name in "ab":
-            command = ["evaluate", str(run / "best.safetensors"), "--scenes", "2", "-o", str(tmp_path / name)]
-            assert main(command) == 0
-            texts.append((tmp_path / name / "results.csv").read_text())
-        assert texts[0] == texts[1]
-
     def test_exception_is_one_sentence(self, tmp_path, capsys):
         torch.save({}, tmp_path / "a.ckpt")
         assert main(["evaluate", str(tmp_path / "a.ckpt")]) == 2

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, FresnelLens, TiDyOptics
 from kornia_tidy.design.tradeoff import Setting, capture, measure, pareto, sweep, sweep_settings
 from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
@@ -77,26 +77,6 @@ class TestMeasure(BaseTester):
         assert banks == [False] * 10 + [True] * 5
         assert versions[6:10] == [versions[6]] * 4
         assert versions[1:6] == list(range(versions[0] + 1, versions[0] + 6))
-
-    @pytest.mark.takes_seconds
-    def test_feature_leaves_the_camera_as_it_was(self):
-        image, depth = scene()
-        optics = TiDyOptics(PixelwiseMask(2), fidelity=QUICK)
-        before = optics.masks.phase.detach().clone()
-        row = measure(optics, image, depth, "draft", torch.zeros_like(image), repeats=1, training=True)
-        assert torch.equal(optics.masks.phase, before)
-        assert optics.masks.phase.grad is None
-        assert optics.fidelity is QUICK
-        assert row.training_bytes > row.capture_bytes > image.nbytes
-        assert row.training_seconds > 0
-
-    @pytest.mark.takes_seconds
-    def test_feature_no_warning_leaves_the_sweep(self):
-        image, depth = scene()
-        optics = TiDyOptics(fidelity=QUICK)
-        tight = Fidelity(enclosed_energy=0.99, max_window=5, layer_spacing=20.0)  # would warn of its window
-        assert measure(optics, image, depth, tight, torch.zeros_like(image), repeats=1).window == 5
-        assert measure(optics, image, depth, "paper", torch.zeros_like(image), repeats=1).window == 23
 
     @pytest.mark.parametrize(
         ("optics", "changes", "sentence"),

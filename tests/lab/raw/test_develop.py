@@ -82,41 +82,6 @@ class TestDevelop(BaseTester):
         assert difference(never_below_black(raw)).mean((1, 2)).max() < 3e-5
         assert difference(never_below_black(raw)).max() < (2e-4 if scale < 1 else 1e-4)
 
-    def test_feature_wide_pixels_are_those_of_libraw(self):
-        """Where pixels are wider than high LibRaw repeats columns, step by step."""
-        path = shared(f"data/{UNLIKE[0]}")
-        raw = RawCapture.open(path)
-        theirs = libraw(path, half_size=True)
-        ours = develop(raw, "half", "daylight", encoded=False, square_pixels=False, upright=False).clamp(0, 1)
-        steps = np.full(round(ours.shape[-1] * raw.pixel_aspect), 1 / raw.pixel_aspect)
-        ours = ours[..., np.cumsum([0, *steps[1:]]).astype(int)]
-        assert ours.shape == theirs.shape
-        assert (ours - theirs).abs().max() < 1e-4
-
-    def test_feature_xtrans_where_two_by_two_pixels_hold_all_colours(self):
-        """LibRaw's half size keeps one sample of each colour in such a square; 1e-4 everywhere.
-
-        Of a colour that is there twice it keeps either, as its threads come by.
-        """
-        path = shared(f"data/{UNLIKE[1]}")
-        raw = RawCapture.open(path)
-        theirs = libraw(path, half_size=True, use_camera_wb=True)
-        factors = balance_factors(raw)
-        index = torch.tensor(raw.pattern).repeat(raw.counts.shape[1] // 6 + 1, raw.counts.shape[2] // 6 + 1)
-        index = index[: raw.counts.shape[1], : raw.counts.shape[2]]
-        light = (raw.mosaic()[0] * (factors / factors.min())[index]).clamp(max=1)
-        errors = []
-        for places in (((0, 0), (0, 1), (1, 0), (1, 1)), ((1, 1), (1, 0), (0, 1), (0, 0))):
-            squares = torch.full((3, *theirs.shape[1:]), torch.nan)
-            for y, x in places:
-                samples, seen = light[y::2, x::2], index[y::2, x::2]
-                squares = torch.where(torch.arange(3)[:, None, None] == seen, samples, squares)
-            ours = torch.einsum("ij,jhw->ihw", srgb_matrix(raw), squares).clamp(0, 1)
-            errors.append((ours - theirs).abs().amax(0))
-        whole = squares.isfinite().all(0)
-        assert whole.float().mean() > 0.2
-        assert torch.minimum(*errors)[whole].max() < 1e-4
-
     @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         ("name", "method"), [(name, method) for name, methods in PICTURES.items() for method in methods]
@@ -213,13 +178,6 @@ class TestDevelop(BaseTester):
             # also a singular matrix, all colours to grey, is a matrix
             flat = develop(raw, matrix=torch.full((3, colors), 1 / colors), encoded=False)
             self.assert_close(flat, torch.full((3, 26, 30), 0.5), atol=2e-5)
-
-    def test_feature_capture_is_left_as_it_was(self):
-        raw = capture(white_balance=torch.tensor([2.0, 1.0, 1.5, 1.0]))
-        before = raw.counts.clone(), raw.white_balance.clone()
-        develop(raw, "bilinear")
-        assert torch.equal(raw.counts, before[0])
-        assert torch.equal(raw.white_balance, before[1])
 
     @pytest.mark.parametrize(
         ("options", "message"),

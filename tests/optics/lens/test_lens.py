@@ -14,7 +14,7 @@ import torch
 from kornia_tidy import ThinLensCamera
 from kornia_tidy.optics import Lens, LensRangeWarning
 from kornia_tidy.optics.lens.first_order import first_order
-from kornia_tidy.optics.lens.joined_rays import inverse_distance, wavefronts
+from kornia_tidy.optics.lens.joined_rays import wavefronts
 from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import stop_quadrature
@@ -44,45 +44,6 @@ class TestLens(BaseTester):
         x, y = torch.linspace(-0.7, 0.7, 9).double(), torch.linspace(0, 0.7, 9).double()
         assert lens.focal_length == pytest.approx(50e-3)
         assert float(path(lens, 0.0, 0.0, x, y).abs().max()) < 1e-3
-
-    def test_feature_paths_obey_fermat(self):
-        """The gradient of the path over the stop is the difference of the rays that meet there."""
-        lens, height, psi = system(symmetric_pair(), 6.0, 0.4), np.array([6e-3]), np.array([5.0])
-        at, step = np.array([[0.3, 0.5], [-0.6, 0.1], [0.0, -0.8]]), 1e-5
-        rise = [
-            wavefronts(lens, GREEN, height, psi, at + shift).path
-            - wavefronts(lens, GREEN, height, psi, at - shift).path
-            for shift in (np.array([step, 0]), np.array([0, step]))
-        ]
-        found = np.stack(rise, -1)[0, 0] / (2 * step * lens.stop_radius)
-        spot = found * 0
-        for i, point in enumerate(at):
-            spot[i] = self.angle_between(lens, height[0], psi, point)
-        self.assert_close(torch.tensor(found), torch.tensor(spot), rtol=1e-5, atol=1e-9)
-
-    @staticmethod
-    def angle_between(lens, height, psi, point):
-        """Direction cosines at the stop of the object's ray less those of the ray to the image."""
-        from kornia_tidy.optics.lens import joined_rays as jr
-
-        indices = lens.prescription.indices(GREEN)
-        slope, at_pupil = jr._chief_lines(lens, np.array([height]))
-        inverse = inverse_distance(lens, psi)
-        tangent = slope - at_pupil * inverse
-        stop_points = np.array([[0.0, 0.0], point]) * lens.stop_radius
-        objects = np.repeat(tangent, 2), np.repeat(inverse, 2)
-        _, front, _ = jr._from_object(lens, indices, objects, stop_points)
-        chief = jr.Rays(front.point[:1], front.direction[:1], np.zeros(1))
-        image = jr._behind(lens, indices, chief)[0].point[0, :2]
-
-        def miss(slopes):
-            ray = jr.Rays(front.point[1:], jr._unit(slopes[None]), np.zeros(1))
-            return jr._behind(lens, indices, ray)[0].point[0, :2] - image
-
-        from scipy.optimize import fsolve
-
-        slopes = fsolve(miss, front.direction[1, :2] / front.direction[1, 2], xtol=1e-12)
-        return front.direction[1, :2] - jr._unit(slopes[None])[0, :2]
 
     def test_feature_seidel_sums_of_a_single_element(self):
         """Spherical aberration, coma, astigmatism and field curvature of third order: to a thousandth."""

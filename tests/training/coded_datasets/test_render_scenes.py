@@ -1,14 +1,12 @@
 from __future__ import annotations
 
 import json
-import pickle
 import shutil
 import tarfile
 from pathlib import Path
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from kornia_tidy import SensorNoise
 from kornia_tidy.data import RGBDFolder
@@ -70,19 +68,6 @@ class TestRenderScenes(BaseTester):
     def test_feature_so_do_jobs(self, whole, tmp_path):
         folder, layout = whole
         assert render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, jobs=2).made == 5
-        assert contents(tmp_path) == contents(folder)
-
-    def test_feature_so_do_threads_even_if_the_camera_has_seen_other_things_before(self, whole, tmp_path):
-        folder, layout = whole
-        before = torch.get_num_threads()
-        torch.set_num_threads(2)
-        try:
-            optics = small_camera()
-            optics.as_transform(seed=0)(small_scenes()[1])
-            render_scenes(optics, small_scenes(), tmp_path, layout, seed=7)
-            assert torch.get_num_threads() == 2
-        finally:
-            torch.set_num_threads(before)
         assert contents(tmp_path) == contents(folder)
 
     def test_feature_what_is_there_is_left_and_what_is_missing_is_made_again(self, whole, tmp_path):
@@ -225,13 +210,6 @@ class TestRefusals(BaseTester):
 
 
 class TestCodedCaptures(BaseTester):
-    @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
-    def test_feature_workers_read_it(self, whole):
-        captures = CodedCaptures(whole[0])
-        sent = pickle.loads(pickle.dumps(captures))  # as it goes to workers that are spawned
-        read = torch.cat([batch["coded"] for batch in DataLoader(sent, batch_size=2, num_workers=1)])
-        assert torch.equal(read, torch.stack([capture["coded"] for capture in captures]))
-
     def test_exception_an_unfinished_folder_says_so(self, tmp_path):
         render_scenes(small_camera(), small_scenes(), tmp_path, rank=0, world=2)
         with pytest.raises(FileNotFoundError, match=r"has no index.csv, which rendering writes last: it has not ended"):

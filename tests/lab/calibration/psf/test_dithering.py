@@ -3,8 +3,6 @@ from __future__ import annotations
 import math
 
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kornia_tidy.lab.calibration.psf import resolve_psf
 from tests.base import BaseTester
@@ -81,21 +79,3 @@ class TestResolvePSF(BaseTester):
         said = torch.stack([one.variance for one in draws[True]]).mean(0)[ring].mean().sqrt()
         assert float(weighted) < 0.5 * float(white)
         assert 0.67 < float(weighted / said) < 1.5
-
-    @given(st.integers(0, SIDE - 1), st.integers(0, SIDE - 1))
-    @settings(max_examples=10)
-    def test_feature_whole_pixels_only_move_it(self, down, right):
-        offsets = places(5)
-        images = airy_like(offsets, 0.8)
-        noise = torch.full_like(images, 1e-8)
-        one = resolve_psf(images, offsets, noise).psf
-        other = resolve_psf(torch.roll(images, (down, right), (1, 2)), offsets, noise).psf
-        self.assert_close(torch.roll(one, (down, right), (0, 1)), other, atol=1e-9)
-
-    def test_feature_the_mean_of_many_images_takes_up_little_of_each(self):
-        offsets = places(32)
-        images = airy_like(offsets, 0.8)
-        many = resolve_psf(images, offsets, torch.full_like(images, 1e-10)).leverage
-        few = resolve_psf(images[:2], offsets[:2], torch.full_like(images[:2], 1e-10)).leverage
-        assert many < 0.13
-        assert few > 0.8

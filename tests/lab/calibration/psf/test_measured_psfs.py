@@ -15,7 +15,7 @@ from kornia_tidy.lab.calibration.psf import (
 )
 from kornia_tidy.masks import fisher_mask
 from tests.base import BaseTester
-from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
+from tests.lab.calibration.psf.captures import exposed, on_pixels, point_light
 
 WINDOW, SIDE = 21, 85
 CAMERA, SPECTRUM = ThinLensCamera(), Spectrum.rgb()
@@ -63,19 +63,6 @@ def captured(coded, flat, count, seed=0, spoil=None, background=0.0):
             if spoil is not None:
                 frames = spoil(n, frames)
             images[z] += point_images(frames, EXPOSURES, SENSOR, WINDOW, reference=clear)
-    return images
-
-
-def of_a_mosaic(coded, flat, tile, count, exposures=EXPOSURES):
-    """Return point images behind a filter array, at random sub-pixel positions."""
-    generator = torch.Generator().manual_seed(0)
-    images = []
-    for _ in range(count):
-        ninths = tuple(torch.randint(-31, 32, (2,), generator=generator).tolist())
-        light, clear = (planes(on_pixels(fine, ninths), tile) for fine in (coded, flat))
-        frames = exposed(0.5 * light / light.max(), exposures, generator, 10500, 2.4, 0.003)
-        clear = exposed(0.8 * clear / clear.max(), torch.ones(1), generator, 10500, 2.4, 0.003)[0]
-        images += point_images(frames, exposures, SENSOR, WINDOW, reference=clear, tile=tile)
     return images
 
 
@@ -149,27 +136,6 @@ class TestMeasurePSFs(BaseTester):
         assert "leave the picture" in image.fault
         with pytest.raises(ValueError, match=r"no point image at 0\.5 m can be used: .* leave the picture"):
             measure_psfs({0.5: [image]}, CAMERA, WINDOW)
-
-    @pytest.mark.slow
-    def test_feature_a_mosaic_gives_the_psfs_on_the_pixels_of_the_sensor(self, coded, flat, truth):
-        """Each plane has every second pixel; several positions of the point resolve the PSF, with both greens."""
-        images = of_a_mosaic(coded[0.8], flat[0.8], ((0, 1), (1, 2)), 24)
-        found = measure_psfs({0.8: images}, CAMERA, WINDOW, CUTOFF)
-        error = (found.bank.psfs - truth[:1]).abs().sum((2, 3))
-        assert float(error.max()) < 0.03
-        assert bool((error < 1.6 * 0.798 * found.uncertainty.sum((2, 3))).all())
-        middle = [(report.row, report.column) for report in found.reports]
-        self.assert_close(torch.tensor(middle).mean(0), torch.full((2,), SIDE // 2 * 1.0), rtol=0, atol=0.3)
-
-    @pytest.mark.slow
-    def test_feature_a_sharp_point_behind_a_mosaic_does_not_diverge(self):
-        """With weights in only one of the two steps, registration would diverge in brightness."""
-        sharp = point_light(PixelwiseMask(1, initial="flat"), 0.0, SIDE, SPECTRUM, CAMERA)
-        images = of_a_mosaic(sharp, sharp, ((0, 1), (1, 2)), 16, torch.tensor([1.0, 8.0, 64.0]))
-        psfs = measure_psfs({0.595: images}, CAMERA, WINDOW, CUTOFF).bank.psfs
-        truth = on_pixels(sharp)[:, INSIDE, INSIDE]
-        error = (psfs - truth / truth.sum((1, 2), keepdim=True)).abs().sum((2, 3))
-        assert float(error.max()) < 0.06
 
     @pytest.mark.parametrize(("tile", "enough", "channel"), [(None, 4, 2), (((0, 1), (1, 2)), 13, 2)])
     def test_feature_too_few_places_are_told_before_any_work(self, tile, enough, channel, monkeypatch):

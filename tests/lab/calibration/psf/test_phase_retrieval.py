@@ -61,13 +61,6 @@ class TestFitMasks(BaseTester):
 
 
 class TestRetrieveMask(BaseTester):
-    @pytest.mark.slow
-    def test_feature_noise_is_found_from_nothing(self):
-        generator = torch.Generator().manual_seed(0)
-        bank = bank_of(PixelwiseMask(1, 11, generator=generator), (-9.0, -3.0, 3.0, 9.0))
-        fit = retrieve_mask(bank, ThinLensCamera(), GREEN, 11, iterations=120, generator=generator)
-        assert float(fit.residual.max()) < 0.02
-
     def test_exception_one_depth(self):
         bank = PSFBank.from_measured(torch.rand(1, 1, 9, 9), torch.zeros(1))
         with pytest.raises(ValueError, match="PSFs at two depths or more"):

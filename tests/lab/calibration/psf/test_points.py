@@ -66,15 +66,6 @@ class TestCentres(BaseTester):
         for centre in (centre_of_light, centre_of_symmetry):
             assert centre(spot(row, column), (20, 20), 25) == pytest.approx((row, column), abs=1e-3)
 
-    def test_feature_noise_of_a_wide_window_moves_the_centre_of_symmetry_less(self):
-        noise = 0.02 * torch.randn(20, 1, 41, 41, generator=torch.Generator().manual_seed(0)).double()
-        images = spot(20.3, 19.8) + noise
-        errors = {
-            centre: sum((centre(image, (20, 20), 31)[0] - 20.3) ** 2 for image in images)
-            for centre in (centre_of_light, centre_of_symmetry)
-        }
-        assert errors[centre_of_symmetry] < 0.1 * errors[centre_of_light]
-
     def test_exception_no_light(self):
         with pytest.raises(ValueError, match="there is no light"):
             centre_of_light(torch.zeros(1, 21, 21), (10, 10), 11)
