@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics, burst, moving_capture
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy import augmentation as ours
 from kornia_tidy.choices import STARTS
 from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
@@ -88,15 +88,6 @@ DRAWS: dict[str, Callable[[], Any]] = {
     "RandomTiDyOptics": lambda: of_augmentation(lambda: ours.RandomTiDyOptics(camera(), exposure=(0.5, 1.0), p=1.0)),
 }
 
-# Poisson draws are left out: rounding may move one by an electron.
-CAPTURES: dict[str, Callable[[], Any]] = {
-    "capture": lambda: camera()(image(), depth(), generator=generator()),
-    "burst": lambda: burst(camera(), image(), depth(), generator=generator()),
-    "motion": lambda: moving_capture(
-        camera(), image().repeat(2, 1, 1, 1), depth().repeat(2, 1, 1, 1), generator=generator()
-    ),
-}
-
 
 def tensors(found: Any) -> list[Tensor]:
     if isinstance(found, Tensor):
@@ -125,8 +116,3 @@ class TestDefaultDtype(BaseTester):
                 continue
             unit = max(torch.finfo(one.dtype).eps, torch.finfo(SINGLE).eps)
             self.assert_close(one.double(), other.double(), rtol=4 * unit, atol=4 * unit * float(other.abs().max()))
-
-    @pytest.mark.parametrize("name", CAPTURES)
-    def test_feature_a_capture_is_the_same_to_rounding(self, name):
-        for one, other in zip(under(torch.float64, CAPTURES[name]), tensors(CAPTURES[name]()), strict=True):
-            self.assert_close(one.float(), other, rtol=0, atol=1e-5)

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -11,11 +10,9 @@ import cv2
 import pytest
 import torch
 
-from kornia_tidy.cli import main
 from kornia_tidy.data.depth_files import write_depth
 from kornia_tidy.data.image_files import write_image
 from tests.base import BaseTester
-from tests.training.coded_datasets.samples import contents
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
@@ -241,20 +238,6 @@ class TestTrainOnRendered(BaseTester):
 
 @pytest.mark.parametrize("example", ["ray_rendering"], indirect=True)
 class TestRayRendering(BaseTester):
-    @pytest.mark.slow
-    @pytest.mark.filterwarnings("ignore")  # of Ray's own
-    def test_feature_two_workers_write_the_files_of_the_command(self, example, tmp_path, monkeypatch):
-        ray = pytest.importorskip("ray", reason="Ray is not installed")
-        monkeypatch.setenv("PYTHONPATH", str(EXAMPLES), prepend=os.pathsep)  # the workers import the script, too
-        options = ["--scenes", "5", "--size", "64", "--masks", "2", "--shard-items", "2"]
-        try:
-            assert example.main([*options, "--workers", "2", "--output", str(tmp_path / "ray")]) == 5
-            assert example.main([*options, "--workers", "2", "--output", str(tmp_path / "ray")]) == 0
-        finally:
-            ray.shutdown()
-        assert main(["render", *options, "-o", str(tmp_path / "command")]) == 0
-        assert contents(tmp_path / "ray") == contents(tmp_path / "command")
-
     def test_exception_without_ray_it_says_how_to_install_it(self, example, monkeypatch):
         monkeypatch.setitem(sys.modules, "ray", None)
         with pytest.raises(SystemExit, match=r"this example needs Ray: pip install 'ray\[data\]'"):

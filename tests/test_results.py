@@ -15,12 +15,10 @@ from tests.base import BaseTester
 from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
 from tests.benchmarks.results.captures import sensor_of
-from tests.benchmarks.results.measure import NO_CAMERA, Measurement, search
-from tests.benchmarks.results.restorations import restorations_for
-from tests.benchmarks.results.scenes import BenchScene, SceneSet, dead_leaves
+from tests.benchmarks.results.measure import NO_CAMERA, search
+from tests.benchmarks.results.scenes import BenchScene, SceneSet
 from tests.benchmarks.results.scores import depth_scores, local_contrast
 from tests.benchmarks.results.store import Cell, Measured, Provenance, Store, SystemRow
-from tests.benchmarks.results.systems import available
 from tests.benchmarks.results.table import Key, Results, paired
 from tests.benchmarks.results.verdicts import FIVE, REAL
 from tests.scenes import halves
@@ -162,39 +160,6 @@ class TestStore(BaseTester):
             assert store.get(self.CELL)["psnr"] == 20.5
             assert store.get(self.CELL._replace(noise="0.002")) == {}
         assert (found.cell, found.provenance) == (self.CELL, HERE)
-
-
-class TestMeasurement(BaseTester):
-    @pytest.mark.takes_seconds
-    def test_feature_an_interrupted_run_goes_on_to_the_same_results(self, tmp_path, monkeypatch):
-        scenes, make = dead_leaves(3, 66), available()[FLAT]
-
-        class Progress:
-            set_postfix_str = staticmethod(lambda _: None)
-            update = staticmethod(lambda: None)
-
-        def run(name):
-            with Store(tmp_path / name, HERE) as store:
-                Measurement(store, scenes).measure(make(), ["0.01"], Progress())
-                return {row.cell: row.scores for row in store.cells()}
-
-        whole = run("whole")
-        put, calls = Store.put, []
-
-        def interrupted(store, cell, scores):
-            if len(calls) == len(whole) // 2:
-                raise KeyboardInterrupt
-            calls.append(cell)
-            put(store, cell, scores)
-
-        monkeypatch.setattr(Store, "put", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            run("parts")
-        monkeypatch.setattr(Store, "put", lambda store, cell, scores: (calls.append(cell), put(store, cell, scores)))
-        assert run("parts") == whole
-        candidates = sum(set(scores) == {"psnr"} for scores in whole.values())
-        assert len(calls) <= len(whole) + len(scenes.half_a) * len(restorations_for(make()))  # those are scored in full
-        assert candidates > 0
 
 
 class TestCommand(BaseTester):

@@ -22,7 +22,7 @@ def histories(draw: st.DrawFn) -> object:
 
 class TestHistories(BaseTester):
     @given(history=histories())
-    @settings(max_examples=10)
+    @settings(max_examples=5)
     def test_property_a_capture_is_that_of_a_new_camera(self, history):
         finding = live(history)
         assert not finding.wrong, finding

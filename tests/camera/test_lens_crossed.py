@@ -168,17 +168,3 @@ class TestGradients(BaseTester):
                     ends.append(float((optics(image, depth) * weight).sum()))
                 parameter.sub_(1e-4 * direction)
             assert (ends[1] - ends[0]) / 2e-4 == pytest.approx(expected, rel=1e-3)
-
-    @pytest.mark.slow
-    def test_feature_masks_are_learnt_through_a_lens(self):
-        """200 steps at the corner of the field, of masks that are to give a sharp picture at every depth."""
-        optics = camera()
-        image, depth = scene()
-        optimizer, losses = torch.optim.Adam(optics.parameter_groups(lr_metres=3e-8)), []
-        for _ in range(200):
-            optimizer.zero_grad()
-            loss = (optics(image, depth) - image).square().mean()
-            loss.backward()
-            optimizer.step()
-            losses.append(float(loss.detach()))
-        assert losses[-1] < 0.75 * losses[0]

@@ -50,6 +50,7 @@ class TestDistorted(BaseTester):
             expected = at * landed / pinhole
             self.assert_close(centroid(seen[channel], center), expected, rtol=0, atol=0.02)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("name", NAMES)
     def test_feature_light_lands_where_an_independent_tracer_says(self, name):
         """At a third, two thirds and all of the field, in each colour; without the warp up to 2.2 px beside it."""

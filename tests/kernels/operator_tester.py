@@ -108,5 +108,31 @@ class SceneOperatorTester(OperatorTester):
             (made[0] if isinstance(made, list) else made).sum().backward()
 
 
+def other_dtype(x: Tensor) -> Tensor:
+    return x.float() if x.dtype == torch.float64 else x.double()
+
+
+class LayeredSceneTester(SceneOperatorTester):
+    """Tests of an operator that takes light, PSFs and labels by name: ``operator``, with arguments from ``scene``."""
+
+    @pytest.mark.parametrize(
+        ("name", "change", "error", "words"),
+        [
+            ("plane", Tensor.half, TypeError, "plane must be float32 or float64, got torch.float16"),
+            ("psfs", other_dtype, TypeError, "psfs must be of the light's dtype .*, got torch.float"),
+            ("layer_weight", other_dtype, TypeError, "layer_weight must be of the light's dtype"),
+            ("plane", lambda x: x[0, 0], ValueError, r"plane must have four dimensions, .*, got \([0-9]+, [0-9]+\)"),
+            ("psfs", lambda x: x[..., :2, :2], ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
+            ("psfs", lambda x: x[:, :1], ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
+            ("layer_index", lambda x: x[..., 1:], ValueError, "layer_index must have shape .*, got"),
+            ("layer_weight", lambda x: x.repeat(3, 1, 1), ValueError, "layer_weight must have shape .*, got"),
+        ],
+    )
+    def test_exception_of_the_scene(self, name, change, error, words):
+        given = self.scene()
+        with pytest.raises(error, match=words):
+            self.operator(**{**given, name: change(given[name])})
+
+
 def is_light(x: object) -> bool:
     return isinstance(x, Tensor) and x.is_floating_point()

@@ -10,7 +10,7 @@ import torch
 
 from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct, occlusion_direct_gradients
 from tests.kernels import kernel_shapes
-from tests.kernels.operator_tester import SceneOperatorTester, needs_compiler
+from tests.kernels.operator_tester import LayeredSceneTester, SceneOperatorTester, needs_compiler
 
 
 def scene(**changes: Any) -> dict[str, Any]:
@@ -24,7 +24,8 @@ def scene(**changes: Any) -> dict[str, Any]:
     return {**arguments, **changes}
 
 
-class TestOcclusionDirect(SceneOperatorTester):
+class TestOcclusionDirect(LayeredSceneTester):
+    scene, operator = staticmethod(scene), staticmethod(occlusion_direct)
     draw = staticmethod(kernel_shapes.occlude)
     source = SOURCE
 
@@ -47,26 +48,7 @@ class TestOcclusionDirect(SceneOperatorTester):
     @pytest.mark.parametrize(
         ("changes", "error", "words"),
         [
-            (
-                {"plane": torch.zeros(2, 2, 11, 34).half()},
-                TypeError,
-                "plane must be float32 or float64, got torch.float16",
-            ),
-            (
-                {"psfs": torch.zeros(3, 2, 3, 3).double()},
-                TypeError,
-                "psfs must be of the light's dtype .*, got .*float64",
-            ),
-            ({"layer_weight": torch.zeros(1, 11, 34).double()}, TypeError, "layer_weight must be of the light's dtype"),
-            ({"plane": torch.zeros(11, 34)}, ValueError, r"plane must have four dimensions, .*, got \(11, 34\)"),
-            ({"psfs": torch.zeros(3, 2, 2, 2)}, ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
             ({"psfs": torch.zeros(3, 2, 5, 5)}, ValueError, "at least 8x32 pixels, got 7x30"),
-            (
-                {"layer_index": torch.zeros(3, 11, 34)},
-                ValueError,
-                r"layer_index must have shape \(2, 11, 34\) or \(1, ",
-            ),
-            ({"layer_weight": torch.zeros(2, 11, 34)}, ValueError, r"layer_weight must have shape \(1, 11, 34\), got"),
             ({"mean": torch.zeros(2, 2)}, ValueError, "a mean needs stray_light, got only mean"),
             ({"stray_light": torch.zeros(3, 2)}, ValueError, "a mean needs stray_light, got only stray_light"),
             ({"mean": torch.zeros(2, 2), "stray_light": torch.zeros(2, 2)}, ValueError, r"stray_light must .*\(3, 2\)"),

@@ -473,7 +473,7 @@ class TestDepthFiles(BaseTester):
 class TestNoFalseAlarm(BaseTester):
     """Warnings are errors here, as in all tests."""
 
-    @pytest.mark.parametrize("name", list(ENTRIES)[::3])
+    @pytest.mark.parametrize("name", list(ENTRIES)[::9])
     def test_feature_real_scenes(self, name):
         found = load_scene(name)
         step = max(1, min(found.image.shape[1:]) // 96)

@@ -98,6 +98,7 @@ class TestFamilies(BaseTester):
 
 @pytest.mark.filterwarnings("ignore:the largest PSF window")  # at psi = 60 the presets' windows are small
 class TestExtremes(BaseTester):
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("name", "limit"), [("draft", 3e-2), ("balanced", 1e-3), ("reference", 3e-4)])
     @pytest.mark.parametrize("kind", ["random", "flat"])
     def test_feature_presets_never_alias(self, kind, name, limit):

@@ -95,6 +95,7 @@ class TestRuledClosedForm(BaseTester):
         self.assert_close(restore.scene_errors[found], error[0])
         self.assert_close(restore.norms[found].square(), blend.square().sum((-2, -1)).mean())
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("noise", [0.002, 0.01, 0.03])
     def test_feature_the_kernel_is_the_one_of_least_error_on_simulated_pictures(self, noise):
         """Of blends of two kernels each, by simulated scene and the noise that counts: within 5 % of the best."""

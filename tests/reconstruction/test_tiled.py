@@ -114,6 +114,7 @@ class TestSeams(BaseTester):
         assert difference <= SEAM
         assert head.closed_form.mean_light is None
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         ("name", "size"),
         [("attention", (287, 29)), ("phasecam3d", (283, 19)), ("joint", (29, 301)), ("nafnet", (29, 331))],

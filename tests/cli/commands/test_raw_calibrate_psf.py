@@ -98,13 +98,6 @@ class TestCalibratePSF(BaseTester):
         optics = TiDyOptics(camera=CAMERA, sensor=None).with_bank(bank)
         assert optics(torch.rand(3, 40, 40), torch.full((1, 40, 40), 0.8)).shape == (3, 40, 40)
 
-    @pytest.mark.slow
-    def test_feature_the_mask_behind_them(self, grey, capsys):
-        more = ["--distances", "0.8", "0.5", "-o", "bank.safetensors", "--fit-mask", "mask.npy", "--mask-size", "5"]
-        assert main(["raw", "calibrate-psf", *grey, *NOISE, *more]) == 0
-        assert "leaves" in capsys.readouterr().out
-        assert np.load("mask.npy").shape == (1, 5, 5)
-
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [

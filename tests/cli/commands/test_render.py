@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -67,14 +65,6 @@ class TestRender(BaseTester):
             monkeypatch.setenv(names[0], rank)
             assert main(["render", *SMALL, "--masks", "2", "--shard-items", "2", "-o", str(tmp_path)]) == 0
             assert f"process {int(rank) + 1} of 2: {made}" in capsys.readouterr().out
-        assert contents(tmp_path) == contents(rendered)
-
-    @pytest.mark.slow
-    def test_feature_torchrun_shares_the_work(self, rendered, tmp_path):
-        torchrun = ["torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "kornia_tidy"]
-        command = [sys.executable, "-m", *torchrun, "render", *SMALL, "--masks", "2", "--shard-items", "2"]
-        done = subprocess.run([*command, "-o", str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=False)
-        assert done.returncode == 0, done.stderr
         assert contents(tmp_path) == contents(rendered)
 
     def test_feature_a_trained_camera_photographs_scenes_of_its_training(self, checkpoint, tmp_path):
