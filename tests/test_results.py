@@ -14,7 +14,6 @@ from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from tests.base import BaseTester
 from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
-from tests.benchmarks.results.captures import sensor_of
 from tests.benchmarks.results.measure import NO_CAMERA, search
 from tests.benchmarks.results.scenes import BenchScene, SceneSet
 from tests.benchmarks.results.scores import depth_scores, local_contrast
@@ -59,18 +58,6 @@ class TestHalves(BaseTester):
         assert (len(first), len(second)) == (18, 17)
         assert first == sorted(names[index] for index in order[:18])
         assert sorted(first + second) == names
-
-
-class TestNoise(BaseTester):
-    def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
-        variances = {}
-        for number in (17.6, 35.2):
-            sensor = sensor_of("10000e", number)
-            white = torch.full((1, 1, 200, 200), 0.5)
-            variances[number] = sensor(white, generator=torch.Generator().manual_seed(0)).double().var().item()
-            electrons = 10000 * (17.6 / number) ** 2
-            expected = 0.5 / electrons + (2.4 / electrons) ** 2
-            assert variances[number] == pytest.approx(expected, rel=5 * math.sqrt(2 / 40000))  # five standard errors
 
 
 GRID = {"a": tuple(2.0**power for power in range(9)), "b": (1.0, 3.0, 9.0)}

@@ -6,11 +6,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.accuracy.depth_energy import Depths, octave_filters
 from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
 from kornia_tidy.accuracy.psf_samples import PSFSamples
-from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, coarser, natural_power, power_spectrum
+from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, natural_power, power_spectrum
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.render.compositing import render
 from tests.base import BaseTester
@@ -71,13 +71,6 @@ class TestPower(BaseTester):
         error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), light_there)
         assert error == pytest.approx(0.1 * float(light.std(correction=0)), rel=0.05)
 
-    @pytest.mark.parametrize("sizes", [(20, 10), (21, 10), (21, 9), (15, 12)])
-    def test_feature_a_coarser_grid_is_that_of_the_image(self, sizes):
-        """On white noise, which has a small covariance at nonzero shifts on both grids."""
-        light = torch.rand(1, 2, 48, 48, dtype=torch.float64)
-        fine, coarse = (power_spectrum(light, "reflect", size) for size in sizes)
-        self.assert_close(coarser(fine, sizes[1]), coarse, atol=1e-12, rtol=1e-9)
-
     def test_feature_one_depth_is_the_image_and_two_have_outlines(self):
         """Of white light, which one depth leaves alone."""
         white = torch.ones(1, 1, 20, 20)
@@ -88,11 +81,6 @@ class TestPower(BaseTester):
 
 
 class TestLayers(BaseTester):
-    def test_feature_bandwidth_is_that_of_the_disc_in_blue(self):
-        """The paper's disc reaches a radius of at most 1.05 * sqrt(2) and at least 1.05."""
-        optics = TiDyOptics(PixelwiseMask(1), spectrum=Spectrum.monochrome(470e-9))
-        assert 1.05**2 * 530 / 470 <= PSFSamples(optics, 1).band <= 1.2 * 530 / 470
-
     @pytest.mark.parametrize("layers", ["nearest", "linear", "cubic", "bandlimited"])
     def test_feature_a_pixel_takes_what_the_camera_gives_it(self, layers):
         """Against the capture of a point, which is the layered PSF of the camera."""

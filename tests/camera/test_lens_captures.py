@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.camera import burst, camera_of_state, moving_capture
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
@@ -187,36 +187,10 @@ class TestLensCaptures(BaseTester):
             with pytest.raises(ValueError, match="one place, or one for each of 2 images, got 3"):
                 take(optics, *given, field_center=[(0.0, 0.0)] * 3)
 
-    @torch.no_grad()
-    def test_feature_noise_does_not_depend_on_whether_places_differ(self):
-        optics = camera(center=(9.0, 9.0))
-        optics.sensor = SensorNoise(0.01)
-        image, depth = (torch.cat([part, part]) for part in scene(24, 24))
-        one, other = (
-            optics(image, depth, field_center=center, generator=torch.Generator().manual_seed(1))
-            for center in (None, [(9.0, 9.0), (9.0, 9.01)])
-        )
-        self.assert_close(one, other, rtol=0, atol=1e-5)
-
     def test_gradcheck_of_places(self):
         optics = camera(fidelity=SETTINGS.replace(double=True))
         image, depth = (torch.cat([part, part]).double() for part in scene(9, 9))
         self.gradcheck(lambda x: optics(x, depth, field_center=[(400.0, 500.0), (0.0, 0.0)]), (image,))
-
-    @torch.no_grad()
-    def test_smoke_colours_states_spectra_and_veils(self):
-        """Each is averaged or summed outside of the rendering that the others test."""
-        image, depth = scene()
-        image = image.expand(2, 3, -1, -1).contiguous()
-        shared_parts = {"spectrum": Spectrum.rgb(), "center": (300.0, 300.0)}
-        each = camera("occlusion", fidelity=SETTINGS.replace(occlusion_states="each"), **shared_parts)
-        mean = camera("occlusion", **shared_parts)
-        self.assert_close(each(image, depth), mean(image, depth), rtol=0, atol=2e-2)
-        for compositing in ("gather", "scatter"):
-            veil = camera(compositing, fidelity=SETTINGS.replace(stray_light="veil"), **shared_parts)
-            white = veil(torch.ones_like(image), torch.full_like(depth, 0.595))
-            light = veil.psf_bank(field=[place(veil, image, (30, 40))]).light[0].mean(0)
-            self.assert_close(white[0, :, 30, 40], light, rtol=0, atol=2e-2 if compositing == "scatter" else 1e-3)
 
     def test_exception_a_veil_behind_what_hides(self):
         optics, (image, depth) = camera("occlusion", fidelity=SETTINGS.replace(stray_light="veil")), scene(24, 24)

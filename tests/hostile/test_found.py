@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from kornia_tidy.data import NYUDepthV2, read_depth
-from kornia_tidy.lab.mask_export import read_slm_frames
 from kornia_tidy.training.callbacks import drop_rows_after
 from tests.base import BaseTester
 from tests.data.published import write_nyu
@@ -84,15 +83,6 @@ class TestFound(BaseTester):
         path.write_bytes(b"epoch,step,loss\n0,5,0.5\n" + bytes(200_000) + b"\n0,10,0.45\n1,20,0.4\n0,\xff\n")
         drop_rows_after(path, 10)
         assert path.read_text().split() == ["epoch,step,loss", "0,5,0.5", "0,10,0.45"]
-
-    def test_feature_a_rotation_that_another_program_wrote_as_90_0(self, readers, tmp_path):
-        case = next(case for case in readers["frames"] if case.source.name == "frames.json")
-        whole = read_slm_frames(case.source.parent).grey
-        for rotate in (0.0, 180.0):
-            result, said = try_read(case, changed(rotate=rotate)(case.source.read_bytes()), tmp_path)
-            assert result == "accepted", said
-            read = read_slm_frames(tmp_path / "case").grey
-            self.assert_close(read, whole if rotate == 0 else whole.rot90(2, (-2, -1)))
 
     @pytest.mark.parametrize("kind", ["external", "link", "soft link", "text", "virtual"])
     def test_exception_hdf5_reads_no_other_file(self, kind, tmp_path):

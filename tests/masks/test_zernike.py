@@ -33,27 +33,6 @@ def disc_quadrature(order: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class TestZernikePolynomials(BaseTester):
-    def test_feature_low_orders_equal_their_closed_forms(self):
-        y, x = torch.rand(2, 50, dtype=torch.float64) * 1.4 - 0.7
-        r2 = x**2 + y**2
-        expected = {
-            0: torch.ones_like(x),
-            1: 2 * y,
-            2: 2 * x,
-            3: math.sqrt(6) * 2 * x * y,
-            4: math.sqrt(3) * (2 * r2 - 1),
-            5: math.sqrt(6) * (x**2 - y**2),
-            6: math.sqrt(8) * (3 * x**2 * y - y**3),
-            7: math.sqrt(8) * (3 * r2 - 2) * y,
-            8: math.sqrt(8) * (3 * r2 - 2) * x,
-            9: math.sqrt(8) * (x**3 - 3 * x * y**2),
-            12: math.sqrt(5) * (6 * r2**2 - 6 * r2 + 1),
-            24: math.sqrt(7) * (20 * r2**3 - 30 * r2**2 + 12 * r2 - 1),
-        }
-        polynomials = zernike_polynomials(25, y, x)
-        for index, formula in expected.items():
-            self.assert_close(polynomials[index], formula, rtol=0, atol=1e-13)
-
     @pytest.mark.parametrize("count", [55, 350])
     def test_feature_orthonormal_on_the_disc(self, count):
         y, x, share = disc_quadrature(40)

@@ -144,14 +144,3 @@ class TestPixelCrosstalk(BaseTester):
             blurred = quad(lambda x: norm.cdf((x + 0.5) / sigma) - norm.cdf((x - 0.5) / sigma), *edges, epsabs=1e-12)
             assert float(kernel[d + reach]) == pytest.approx(blurred[0], abs=1e-9)
         assert float(kernel.sum()) == pytest.approx(1, abs=1e-12)
-
-    def test_feature_even_masks_stay_and_steps_are_rounded(self):
-        crosstalk = PixelCrosstalk(0.5)
-        even = torch.full((2, 9, 9), 1.7)
-        self.assert_close(crosstalk(even), even, rtol=0, atol=1e-6)
-        step = torch.zeros(1, 9, 9)
-        step[..., 5:] = 2 * math.pi
-        shown = crosstalk(step)[0, 4]
-        assert bool((shown.diff() >= 0).all())
-        assert float(shown[4]) == pytest.approx(2 * math.pi - float(shown[5]), abs=1e-5)
-        assert 0.3 < float(shown[4]) < 2.0

@@ -50,12 +50,6 @@ class TestThinLensCamera(BaseTester):
         assert lo == pytest.approx(-20.02, abs=5e-3)
         assert hi == pytest.approx(-lo)
 
-    def test_feature_image_distance_is_not_the_focal_length(self):
-        """1/f = 1/s + 1/s': 9 % longer at 0.6 m."""
-        camera = ThinLensCamera()
-        assert 1 / camera.image_distance + 1 / 0.595 == pytest.approx(1 / 50e-3)
-        assert camera.image_distance / 50e-3 == pytest.approx(1.092, abs=1e-3)
-
     @pytest.mark.parametrize("depth_range", [(0.3, math.inf), (0.5, 4.0)])
     def test_feature_depth_is_the_inverse_of_defocus_and_infinity_is_exact(self, depth_range, dtype):
         if dtype not in {torch.float32, torch.float64}:
@@ -148,12 +142,6 @@ class TestThinLensCamera(BaseTester):
     def test_exception_f_number(self, options, sentence):
         with pytest.raises(ValueError, match=sentence):
             ThinLensCamera(**options)
-
-    def test_smoke_repr_tells_the_lens(self):
-        words = repr(ThinLensCamera())
-        assert "50 mm f/17.6" in words
-        assert "0.595 m" in words
-        assert "psi +20.02 to -20.02" in words
 
 
 class TestDefocusRange(BaseTester):

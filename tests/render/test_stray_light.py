@@ -108,17 +108,6 @@ class TestReference(BaseTester):
             error = rendered(image, layer, narrow, compositing, border) - expected
             assert np.abs(error).max() <= float(narrow.veil[0, 0]) * np.abs(image - image.mean()).max() + 1e-11
 
-    @pytest.mark.parametrize(("stray_light", "least"), [("renormalize", 0.3), ("discard", 0.3)])
-    @pytest.mark.parametrize("border", ["reflect", "zero"])
-    def test_feature_each_choice_is_for_one_border(self, stray_light, least, border):
-        """On white: "renormalize" is right where the image goes on, "discard" in the dark if the window is whole."""
-        whole = bank("random", WHOLE - 34, "veil").psfs[:, 0].numpy()
-        stray = 1 - whole[0].sum()
-        expected = truth(*scene("white"), whole, "gather", border) + (stray if border == "reflect" else 0)
-        error = rms(rendered(*scene("white"), bank("random", WHOLE - 34, stray_light), "gather", border) - expected)
-        right = (stray_light == "renormalize") == (border == "reflect")
-        assert error < 1e-11 if right else error > least * stray
-
 
 class TestShareWithin(BaseTester):
     @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 4), (11, 12)])

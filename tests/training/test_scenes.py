@@ -98,12 +98,6 @@ class TestSceneLoader(BaseTester):
         assert same(whole, again)
         assert [b["noise_seed"] for b in whole] == [b["noise_seed"] for b in again]
 
-    def test_feature_global_generators_are_left_alone(self):
-        before = torch.get_rng_state(), random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
-        list(SceneLoader(Noisy(), 2, augment=True))
-        assert torch.equal(before[0], torch.get_rng_state())
-        assert before[1:] == (random.getstate(), np.random.get_state()[1].tolist())  # noqa: NPY002
-
     def test_feature_noise_seeds_follow_the_scenes_and_the_epoch(self):
         loader = SceneLoader(Noisy(), 1)
         seeds = [batch["noise_seed"] for batch in loader]
