@@ -363,7 +363,7 @@ def _occluding_over_field(draw: random.Random) -> tuple[tuple[Any, ...], Layered
         parts += [torch.tensor(edges), middles, weights]
     psfs = arguments[1] * (0.75 + 0.5 * torch.rand(*nodes, *arguments[1].shape, dtype=arguments[1].dtype))
     scene = replace(scene, psfs=psfs.flatten(0, 1), field=Field(scene.output_size, nodes))
-    scene.found["places"] = Places(*parts)  # in place of tiles of one size
+    vars(scene)["places"] = Places(*parts)  # in place of tiles of one size
     about = f"{about} nodes {nodes} tiles {len(parts[1])}x{len(parts[4])}"
     return (arguments[0], psfs, *arguments[2:7], parts), scene, about, math.prod(nodes) * products
 
