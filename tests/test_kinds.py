@@ -112,7 +112,6 @@ EXEMPT = {
     "FrameTime": ({"feature", "exception"}, RECORD),
     "JointEstimate": ({"feature", "exception"}, RECORD),
     "MaskFit": ({"exception"}, RECORD),
-    "PointReport": ({"exception"}, RECORD),
     "RenderPlan": ({"feature", "exception"}, RECORD),
     "ResolvedPSF": ({"feature", "exception"}, RECORD),
     "Restoration": ({"feature", "exception"}, RECORD),
@@ -121,7 +120,6 @@ EXEMPT = {
     "depth_at": ({"exception"}, REFUSES_NOTHING),
     "draw_depth": ({"exception"}, REFUSES_NOTHING),
     "register": ({"exception"}, REFUSES_NOTHING),
-    "require_matplotlib": ({"feature", "exception"}, "matplotlib is there wherever its pictures are tested"),
     "resolve_psf": ({"exception"}, REFUSES_NOTHING),
 }
 
