@@ -187,7 +187,8 @@ def read_command(argv: Sequence[str]) -> Any:
         if name not in commands:
             parser = _overview(commands, prog)
             if name and not name.startswith("-"):
-                meant = get_close_matches(name, commands, 1)
+                groups = [group for group, inner in commands.items() if isinstance(inner, dict) and name in inner]
+                meant = [f"{group} {name}" for group in groups] + get_close_matches(name, commands, 1)
                 parser.error(f"there is no command {name}" + (f" (did you mean {meant[0]}?)" if meant else ""))
             parser.parse_args(words)
         chosen, prog, words = commands[name], f"{prog} {name}", words[1:]

@@ -169,6 +169,10 @@ class TestMistakes(BaseTester):
         [
             ([], "the following arguments are required: COMMAND; see kornia-tidy --help"),
             (["trainn"], "there is no command trainn (did you mean train?); see kornia-tidy --help"),
+            (
+                ["reconstruct"],
+                "there is no command reconstruct (did you mean raw reconstruct?); see kornia-tidy --help",
+            ),
             (["raw", "simulat"], "there is no command simulat (did you mean simulate?); see kornia-tidy raw --help"),
             (
                 ["train", "--task", "depht"],
