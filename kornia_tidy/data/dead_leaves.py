@@ -117,7 +117,7 @@ def depth_of(inverse_depth: NDArray[np.float64], near: float, far: float) -> NDA
 
 
 class PaintedScenes(SceneDataset):
-    """Base class of data sets of scenes that are painted on access and not stored; each has a seed of its own.
+    """Base class of data sets of scenes that are painted on access and not stored; each has its own seed.
 
     Subclasses name their scenes, and paint them by :meth:`paint`. For arguments see :class:`DeadLeaves`.
     """

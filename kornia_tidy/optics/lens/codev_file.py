@@ -34,7 +34,7 @@ def read_codev(text: str) -> FileLens:
     Convention:
         - ``RDM`` in the file chooses radii or curvatures of surfaces: the defaults of programs differ.
         - Spheres, conics and aspheres to the 20th power are read. Decentred and tilted surfaces, mirrors, apertures
-          that are no discs and commands that are not known are refused by name.
+          that are not discs and commands that are not known are refused by name.
 
     Source: CODE V Reference Manual (Synopsys), chapters on lens data and materials, for the meaning of the commands.
     """

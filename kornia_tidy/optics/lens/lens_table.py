@@ -18,8 +18,8 @@ EXACT = ("wavelengths", "defocus", "field")  # in float64 in files too
 class LensTable:
     """Coefficients of a lens, for fields along +x; W wavelengths, S terms in defocus, H heights, J polynomials.
 
-    Zernike polynomials are those of :func:`kornia_tidy.optics.zernike.zernike_polynomials` over the stop; of functions
-    that are mirrored at the field's axis the cosines, of those that change sign there the sines.
+    Zernike polynomials are those of :func:`kornia_tidy.optics.zernike.zernike_polynomials` over the stop.
+    Functions that are mirrored at the field's axis take the cosines; those that change sign there take the sines.
 
     Args:
         wavelengths: (W,) metres.
