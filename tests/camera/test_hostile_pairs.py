@@ -130,7 +130,7 @@ SETTINGS = [
     Setting("color", "srgb", {"color_space": "srgb"}),
     Setting("sensor", "full well of 1", {"sensor": SensorNoise(0.0, full_well=1.0)}),
     Setting("sensor", "full well of 1e12", {"sensor": SensorNoise(0.0, full_well=1e12)}),
-    Setting("sensor", "1 bit, much read noise", {"sensor": SensorNoise(10.0, bits=1)}),
+    Setting("sensor", "1 bit, much read noise", {"sensor": SensorNoise(1.0, bits=1)}),
     Setting("type", "float16", dtype=torch.float16),
     Setting("type", "bfloat16", dtype=torch.bfloat16),
     Setting("type", "float64", dtype=torch.float64),
