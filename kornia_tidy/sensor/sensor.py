@@ -227,9 +227,7 @@ class SensorNoise(Sensor):
         super().__init__()
         check_not_negative("sigma", sigma, "in units of full scale")
         if sigma > 1:
-            said = (
-                f"sigma is {sigma:g} times full scale: divide grey levels of 8 bits by 255, electrons by the full well"
-            )
+            said = f"sigma is {sigma:g} times full scale: divide 8-bit levels by 255, electrons by the full well"
             warn_once(None, "sigma of a sensor", said)
         check_not_negative("dark", dark, "electrons")
         if full_well is not None:

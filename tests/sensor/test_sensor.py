@@ -55,5 +55,5 @@ class TestSensor(BaseTester):
         SensorNoise(0.01, clip=False)(1000 * light)
         with pytest.warns(UserWarning, match="times full scale on average .*: divide 8-bit values by 255"):
             SensorNoise(0.01)(255 * torch.rand(1, 3, 8, 8))
-        with pytest.warns(UserWarning, match="sigma is 5 times full scale: divide grey levels of 8 bits by 255"):
+        with pytest.warns(UserWarning, match="sigma is 5 times full scale: divide 8-bit levels by 255"):
             SensorNoise(5.0)
