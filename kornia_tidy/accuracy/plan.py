@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,12 +13,15 @@ from kornia_tidy.accuracy.planner import PlannedScene, Planner
 from kornia_tidy.accuracy.render_plan import RenderPlan
 from kornia_tidy.accuracy.wide_plan import plan_rays
 from kornia_tidy.checks import check_positive
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.psf.psf_cache import nodes_around
 
 OF_FIELD = 0.3  # of the tolerance, for PSFs between places of the field
 # Root mean square error over that of the light, for a field_tolerance of one; measured .001 to .034, with gather,
 # scatter and occlusion, noise and leaves, five masks, one and none, at the corner of a single element.
 FIELD_ERROR = 0.035
+INDEX, LEAST_CURVED = 1.5, 1.0  # of a single element, and rad that show in PSFs
 LEAST_TOLERANCE, MOST_TOLERANCE = 1e-3, 0.3  # of the field
 
 
@@ -40,11 +44,32 @@ def plan_scene(
     scene = planner.scene(defocus, light)
     if optics.lens is not None:
         return _through_lens(optics, scene, (defocus.shape[-2], defocus.shape[-1]), tolerance)
-    if (blur := planner.wide_blur) is None:
-        return scene.plan(tolerance)
-    rays = plan_rays(optics, blur, scene, defocus, tolerance)
-    exact = rays.predicted_error > tolerance and planner.allows(scene.reference, *defocus.shape[-2:])
-    return scene.plan(tolerance) if exact else rays
+    left_out = _lens_left_out(optics, defocus.shape[-2], defocus.shape[-1])
+    if (blur := planner.wide_blur) is not None:
+        rays = plan_rays(optics, blur, scene, defocus, tolerance)
+        if rays.predicted_error <= tolerance or not planner.allows(scene.reference, *defocus.shape[-2:]):
+            return replace(rays, left_out=left_out)
+    return replace(scene.plan(tolerance), left_out=left_out)
+
+
+def _lens_left_out(optics: Any, height: int, width: int) -> str:
+    r"""Return what a real lens would change in a picture, in words, by the curved field of a single thin element.
+
+    .. math:: \psi(h) = -\frac{\pi}{2 \lambda_0} \left( 2 + \frac{1}{n} \right) \frac{(R h / s')^2}{f}
+
+    Source: Welford, Aberrations of Optical Systems (1986), chapter 12: its medial focus, with the stop at the element.
+    """
+    camera = optics.camera.lens if isinstance(optics.camera, DefocusRange) else optics.camera
+    y, x = optics.field_center
+    corner = math.hypot(abs(y) + height / 2, abs(x) + width / 2) * camera.pixel_pitch
+    bent = (2 + 1 / INDEX) * (camera.aperture_radius * corner / float(camera.image_distance)) ** 2
+    psi = math.pi / (2 * REFERENCE_WAVELENGTH) * bent / camera.focal_length
+    if psi < LEAST_CURVED:
+        return ""
+    return (
+        f"a real lens (lens=): in the corner, {corner * 1e3:.2g} mm from the axis, a single element of this aperture "
+        f"focuses {psi:.2g} rad nearer, a good lens less"
+    )
 
 
 def _through_lens(optics: Any, scene: PlannedScene, size: tuple[int, int], tolerance: float) -> RenderPlan:

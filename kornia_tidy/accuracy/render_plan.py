@@ -26,6 +26,7 @@ class RenderPlan:
         wavelengths: computed for each layer, and those of the camera's spectrum, which the reference uses.
         states: number of states of the exposure that are rendered one by one; 1 except for occlusion.
         field: places along the picture's height and width at which PSFs are computed.
+        left_out: what the camera's ideal lens leaves out, in words; empty where it does not show.
     """
 
     fidelity: Fidelity
@@ -41,6 +42,7 @@ class RenderPlan:
     wavelengths: tuple[int, int]
     states: int = 1
     field: tuple[int, int] = (1, 1)
+    left_out: str = ""
 
     def __str__(self) -> str:
         """Describe the computation, its approximations and its cost in words."""
@@ -52,6 +54,7 @@ class RenderPlan:
         states = f", an image for each of {self.states} states of the exposure" if self.states > 1 else ""
         places = "" if self.field == (1, 1) else f", at {self.field[0]}x{self.field[1]} places over the picture"
         parts = [f"{name} (error {error:.1e})" for name, error in self.error_parts if error > 0]
+        lines = [f"  leaves out: {self.left_out}"] if self.left_out else []
         return "\n".join(
             [
                 first,
@@ -61,5 +64,6 @@ class RenderPlan:
                 f"  approximates: {', '.join(parts) or 'nothing'}",
                 f"  costs: {self.operations:.2g} operations, {self.operations / self.reference_operations:.2%} of the "
                 f"reference's, and {self.memory_bytes / 2**20:.0f} MiB",
+                *lines,
             ]
         )

@@ -17,6 +17,8 @@ from kornia_tidy.figures.field_measures import (
     measures_over_field,
 )
 from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, new_figure, open_chart, require_matplotlib
+from kornia_tidy.masks.no_mask import NoMask
+from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
 if TYPE_CHECKING:
@@ -26,14 +28,15 @@ if TYPE_CHECKING:
 WIDTH, PLOTS, CELL = 12.8, 3.0, 1.2  # inches
 LABEL, SMALL = 9, 8  # pt
 PAPER = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5}  # behind words on rays
+_CELLS, _PITCH = 23, 8e-6  # of a pupil that a lens's own stop cuts, and of pixels, in metres
 HELD = 0.95  # share of the light in the window that a cell of the montage shows
 
 
-def draw_lens(optics: TiDyOptics, field: int = 5) -> Figure:
+def draw_lens(optics: TiDyOptics | Lens, field: int = 5) -> Figure:
     """Draw the PSFs of a camera with a real lens over field, depth and colour, its spot diagram, and its MTF.
 
     Args:
-        optics: the camera; its masks are in the PSFs and the MTF. ``NoMask()`` shows the lens only.
+        optics: the camera; its masks are in the PSFs and the MTF. A lens is drawn without masks, for pixels of 8 um.
         field: number of heights from the axis to the corner.
 
     Returns:
@@ -53,6 +56,8 @@ def draw_lens(optics: TiDyOptics, field: int = 5) -> Figure:
         1280
     """
     require_matplotlib()
+    if isinstance(optics, Lens):
+        optics = TiDyOptics(NoMask(_CELLS), optics.camera(_PITCH), sensor=None, lens=optics)
     if optics.lens is None:
         raise ValueError("a lens is drawn of a camera that has one, got none: give it lens='single-50mm' or another")
     heights = heights_to_corner(optics.lens, field)

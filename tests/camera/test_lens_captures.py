@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy import NoMask, PixelwiseMask, TiDyOptics
 from kornia_tidy.camera import burst, camera_of_state, moving_capture
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
@@ -254,6 +254,25 @@ class TestLensCaptures(BaseTester):
         together = model.psf_bank(defocus=[-19.0, -3.0, 2.0, 20.0], field=[(0.0, 0.0), CORNER])
         alone = model.psf_bank(defocus=[2.0], field=[CORNER])
         assert torch.equal(alone.psfs[0, 0], together.psfs[1, 2])
+
+    @pytest.mark.parametrize("name", ["single-50mm", "triplet-50mm"])
+    @torch.no_grad()
+    def test_smoke_names_fit_the_default_camera(self, name):
+        """Without a warning, though a lens's lengths differ a little from the camera's."""
+        image, depth = scene(24, 24)
+        assert TiDyOptics(NoMask(23), lens=name, fidelity=SETTINGS)(image, depth).shape == image.shape
+
+    @torch.no_grad()
+    def test_feature_a_plan_tells_of_a_lens_that_is_left_out(self):
+        """The curved field of a thin element is within a tenth that of the single element, traced."""
+        optics = TiDyOptics(NoMask(23), fidelity=SETTINGS)
+        near, far = (optics.plan(torch.full((1, *size), 0.6), tolerance=1e-2) for size in ((64, 64), (1110, 1282)))
+        assert near.left_out == ""
+        told = float(far.left_out.split("focuses ")[1].split(" rad")[0])
+        lens = Lens.named("single-50mm", optics.camera.f_number, optics.camera.focus_distance)
+        defocus = lens.sample(torch.tensor([0.0, lens.field]), torch.zeros(1), 530e-9).wavefront[:, 0, 2]
+        assert abs(told / (2 * math.sqrt(3) * float(defocus[0] - defocus[1])) - 1) < 0.1
+        assert "leaves out: a real lens (lens=): in the corner, 6.8 mm from the axis" in str(far)
 
     def test_exception_more_places_than_there_are_warn(self):
         model = camera(fidelity=SETTINGS.replace(field_tolerance=1e-7)).psf_model

@@ -34,6 +34,15 @@ class TestDrawLens(BaseTester):
         assert len(check_texts(figure, words)) == 3 + 10 + 3 + 15 + 9
         assert len(figure.axes) == 2 * 3 * 5 + 3
 
+    def test_feature_a_lens_draws_itself_without_masks(self):
+        lens = Lens.from_seidel(50e-3, 17.6, 0.595, 5e-3, coma=1.0, wavelengths=(470e-9, 530e-9, 610e-9))
+        bare = TiDyOptics(NoMask(23), lens.camera(PITCH), lens=lens)
+        drawn, expected = (
+            [image.get_array() for axes in figure.axes for image in axes.images]
+            for figure in (lens.show(2), draw_lens(bare, 2))
+        )
+        assert all(np.array_equal(*pair) for pair in zip(drawn, expected, strict=True))
+
     def test_exception_no_lens(self):
         with pytest.raises(ValueError, match="a lens is drawn of a camera that has one, got none"):
             draw_lens(TiDyOptics(fidelity="draft"))
@@ -81,6 +90,15 @@ class TestMeasuresOverField(BaseTester):
         assert heads.split()[:4] == ["height", "depth", "psi,", "rad"]
         assert lines[0].split()[:4] == ["0.00", "mm", "0.595", "m"]
         assert {line.index("nm") for line in lines} == {lines[0].index("nm")}
+
+    def test_feature_a_lens_draws_itself_without_masks(self):
+        lens = Lens.from_seidel(50e-3, 17.6, 0.595, 5e-3, coma=1.0, wavelengths=(470e-9, 530e-9, 610e-9))
+        bare = TiDyOptics(NoMask(23), lens.camera(PITCH), lens=lens)
+        drawn, expected = (
+            [image.get_array() for axes in figure.axes for image in axes.images]
+            for figure in (lens.show(2), draw_lens(bare, 2))
+        )
+        assert all(np.array_equal(*pair) for pair in zip(drawn, expected, strict=True))
 
     def test_exception_no_lens(self):
         with pytest.raises(ValueError, match="need a camera with a lens, got none"):

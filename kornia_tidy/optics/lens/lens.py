@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
 from typing import Any, Self
 
 import torch
@@ -30,6 +31,8 @@ from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import light_through_stop
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.tensor_files import parse_tensors, read_tensors
+
+_SLACK = 3e-3  # of the range of defocus: lengths of a camera may differ by a thousandth from its lens's
 
 
 class LensRangeWarning(UserWarning):
@@ -289,6 +292,27 @@ class Lens(nn.Module):
         check_mask_shift(mask_shift, self.field)
         return type(self)(*self._parts()._replace(table=replace(self._table, mask_shift=float(mask_shift))))
 
+    def show(self, field: int = 5) -> Any:
+        """Draw PSFs over field, depth and colour without masks, the spot diagram and the MTF, for pixels of 8 um.
+
+        :func:`kornia_tidy.figures.draw_lens` draws those of a camera, with its masks and pixels.
+
+        Args:
+            field: number of heights from the axis to the corner.
+
+        Returns:
+            A figure of matplotlib; a notebook shows it, ``figure.savefig(path)`` writes it.
+
+        Raises:
+            ImportError: if matplotlib is missing.
+
+        Example:
+            >>> figure = Lens.from_seidel(50e-3, 17.6, 0.595, 5e-3, coma=1.0).show(field=2)
+            >>> len(figure.axes) > 5
+            True
+        """
+        return import_module("kornia_tidy.figures").draw_lens(self, field)  # only who draws needs figures
+
     # ------------------------------------------------------------------ its effect on light
 
     @property
@@ -400,7 +424,7 @@ class Lens(nn.Module):
         if float(heights.max()) > self.field * (1 + 1e-6):
             beyond.append(f"a field of {float(heights.max()):.4g} m beyond {self.field:.4g} m")
         low, high = self.defocus_range
-        slack = 1e-6 * (high - low) + 1e-6
+        slack = _SLACK * (high - low) + 1e-6
         if float(defocus.min()) < low - slack or float(defocus.max()) > high + slack:
             worst = float(defocus.min()) if float(defocus.min()) < low - slack else float(defocus.max())
             beyond.append(f"a defocus of {worst:.4g} rad beyond {low:.4g} to {high:.4g} rad")
