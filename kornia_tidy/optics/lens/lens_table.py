@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from functools import cache, lru_cache
 from typing import cast
@@ -119,14 +120,16 @@ class LensTable:
         return height_weights(self.tangent.shape[1], relative, crowding) @ self.tangent.double().T @ terms.T
 
     def _wave_weights(self, wavelength: float) -> Tensor:
-        """Return the weights of polynomial interpolation over wavelength, (W,), from three wavelengths at most."""
-        known = self.wavelengths.double()
-        weights = torch.zeros_like(known)
-        nearest = (known - wavelength).abs().argsort()[:3]
-        at = min(max(wavelength, float(known.min())), float(known.max()))
-        for i in nearest.tolist():
-            others = [float(known[j]) for j in nearest.tolist() if j != i]
-            weights[i] = torch.tensor([(at - x) / (float(known[i]) - x) for x in others], dtype=torch.float64).prod()
+        """Return the weights of polynomial interpolation over wavelength, (W,), from three wavelengths at most.
+
+        Over its inverse square, along which indices of glasses are nearly straight (Cauchy).
+        """
+        known, weights = self.wavelengths.double().pow(-2).tolist(), torch.zeros(len(self.wavelengths)).double()
+        at = min(max(wavelength**-2, min(known)), max(known))
+        nearest = sorted(range(len(known)), key=lambda i: abs(known[i] - at))[:3]
+        for i in nearest:
+            others = [known[j] for j in nearest if j != i]
+            weights[i] = math.prod((at - x) / (known[i] - x) for x in others)
         return weights
 
 
