@@ -39,23 +39,6 @@ class TestLinearCamera(BaseTester):
         size = (operator(x.abs()).double().abs() * y.abs().double()).sum()
         assert (left - right).abs() < 2 * gamma(9 * 9 * 5, kind) * size
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter"])
-    @pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-    def test_feature_dot_product_through_a_lens(self, compositing, kind):
-        """At the corner of a single element, whose PSFs vary over the picture."""
-        optics = TiDyOptics(
-            PixelwiseMask(1),
-            lens="single-50mm",
-            compositing=compositing,
-            fidelity=Fidelity(window=9, layer_spacing=20.0, field_tolerance=1e-3),
-            field_center=(450.0, 520.0),
-        )
-        operator = LinearCamera(optics, torch.linspace(0.4, 2.0, 70 * 80).view(1, 1, 70, 80))
-        x, y = (torch.randn(1, 3, 70, 80, dtype=kind) for _ in range(2))
-        left, right = (operator(x).double() * y.double()).sum(), (x.double() * operator.adjoint(y).double()).sum()
-        size = (operator(x.abs()).double().abs() * y.abs().double()).sum()
-        assert (left - right).abs() < 2 * gamma(3 * 9 * 9 * 5, kind) * size
-
     def test_feature_each_image_has_its_place_behind_a_lens(self):
         """Of a depth for each image, and of one for all; the transpose too."""
         fidelity = Fidelity(window=9, layer_spacing=20.0)

@@ -67,14 +67,6 @@ class TestSceneGeometry(BaseTester):
         assert 0.05 < (~out.valid).float().mean() < 0.4
         assert torch.isin(out.depth, depth).all()  # nearest: no depth between two things
 
-    @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-    def test_feature_depth_keeps_every_digit_whatever_the_type_of_the_image(self, kind):
-        image, depth = scene(2)
-        depth = depth * 12345.678
-        out = SceneGeometry(K.RandomVerticalFlip(p=1.0))(image.to(kind), depth)
-        assert out.image.dtype == kind
-        assert torch.equal(out.depth, depth.flip(-2))
-
     def test_feature_enlarged_scenes_are_nearer_where_that_is_asked_for(self):
         image, depth = scene(2)
         affine = K.RandomAffine(0.0, scale=(2.0, 2.0), p=1.0)

@@ -163,23 +163,6 @@ class TestSecondDerivatives(BaseTester):
 @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning", "ignore:.torch.jit:DeprecationWarning")
 @over_compositing
 class TestTransformsOfTorch(BaseTester):
-    def test_feature_grad_is_that_of_a_backward_pass(self, compositing):
-        optics, (image, depth) = camera(compositing), scene()
-        masks = masks_of(optics)
-
-        def loss(masks, image, depth):
-            return functional_call(optics, masks, (image, depth)).square().mean()
-
-        for number, wanted in enumerate((masks, image, depth)):
-            inputs = [masks, image, depth]
-            found = grad(loss, argnums=number)(*inputs)
-            leaf = wanted["masks.phase"] if isinstance(wanted, dict) else wanted
-            leaf.requires_grad_()
-            expected = torch.autograd.grad(loss(*inputs), [leaf])
-            leaf.requires_grad_(False)
-            for ours, theirs in zip(found.values() if isinstance(found, dict) else [found], expected, strict=True):
-                self.assert_close(ours, theirs, rtol=0, atol=1e-11 * float(theirs.abs().max()))
-
     def test_feature_jvp_and_dual_numbers_are_the_product_with_the_gradient(self, compositing):
         optics, (image, depth) = camera(compositing), scene()
         masks = masks_of(optics)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, TiDyOptics, burst, moving_capture
+from kornia_tidy import Fidelity, LearnableDwellTimes, PixelwiseMask, TiDyOptics
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING
 from tests.base import BaseTester
@@ -39,12 +39,6 @@ class TestEmptyBatch(BaseTester):
             assert float(parameter.grad.abs().max()) == 0
         assert image.grad.shape == image.shape
         assert depth.grad.shape == depth.shape
-
-    def test_feature_bursts_and_moving_scenes(self):
-        optics, (image, depth) = camera(), scenes()
-        assert burst(optics, image, depth).shape == (0, 2, 3, 24, 32)
-        images, depths = torch.rand(0, 2, 3, 24, 32), torch.rand(0, 2, 1, 24, 32)
-        assert moving_capture(optics, images, depths).shape == (0, 3, 24, 32)
 
     def test_exception_a_plan_needs_a_scene(self):
         image, depth = scenes()

@@ -21,22 +21,6 @@ def convolved(image: Tensor, psfs: Tensor) -> Tensor:
 
 
 class TestDepth(BaseTester):
-    def test_feature_infinity_is_exactly_the_far_end(self, device, dtype):
-        optics = camera(sensor=None, color_space="linear").to(device)
-        image, depth = (x.to(device, dtype) for x in scene())
-        bank = optics.psf_bank(dtype=dtype)
-        assert float(bank.defocus[0]) == pytest.approx(-math.pi * (2.835e-3 / 2) ** 2 / (530e-9 * 0.595))
-        coded = optics(image, torch.full_like(depth, math.inf))
-        self.assert_close(coded, convolved(image, bank.psfs[0]))
-        assert optics.clamped_pixels == 0
-
-    def test_feature_focus_is_exactly_the_node_at_zero(self, device, dtype):
-        optics = camera(sensor=None, color_space="linear").to(device)
-        image, depth = (x.to(device, dtype) for x in scene())
-        bank = optics.psf_bank(dtype=dtype)
-        assert abs(float(bank.defocus[2])) < 1e-12
-        self.assert_close(optics(image, torch.full_like(depth, 0.595)), convolved(image, bank.psfs[2]))
-
     def test_feature_nearer_than_the_range_is_the_near_end_counted_and_said_once(self):
         optics, (image, depth) = camera(sensor=None, color_space="linear"), scene(1)
         depth = torch.full_like(depth, 0.2975)  # half the focus distance: the near end itself

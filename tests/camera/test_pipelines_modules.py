@@ -40,12 +40,6 @@ class TestHalfPrecision(BaseTester):
         expected = copy.deepcopy(optics).float()(image.float(), depth.float(), params=params)
         assert units_in_last_place(coded, expected.to(low)) <= 1
 
-    def test_feature_heights_survive_the_cast(self, low):
-        # In metres they would not: 1.2e-6 is subnormal in float16.
-        masks = PixelwiseMask()
-        error = (masks.heights() - copy.deepcopy(masks).to(low).heights()).abs().max()
-        assert error < 1.2e-6 * torch.finfo(low).eps
-
     def test_feature_gradients_reach_the_masks_in_their_type(self, low):
         optics, (image, depth) = camera().to(low), scene()
         optics(image.to(low), depth.to(low)).float().square().mean().backward()

@@ -17,7 +17,6 @@ from torch import Tensor
 from kornia_tidy import Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.masks import NoMask
 from kornia_tidy.psf import exact
-from kornia_tidy.psf import psf_model as module
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=8.0)
@@ -103,15 +102,6 @@ class TestThreads(BaseTester):
             expected = [captures(index) for index in range(THREADS)]
             for one, other in zip(chain(*in_threads(captures)), chain(*expected), strict=True):
                 assert torch.equal(one, other)
-
-    @torch.no_grad()
-    def test_feature_rgb_and_grey_by_turns_do_not_evict_each_other(self, monkeypatch):
-        optics = camera()
-        for sample in SAMPLES:
-            optics(*sample)
-        monkeypatch.setattr(module, "exact_psf_bank", lambda *_: pytest.fail("a PSF was computed again"))
-        for sample in SAMPLES:
-            optics(*sample)
 
     def test_feature_gradients_in_threads_are_those_of_one(self):
         optics = camera()

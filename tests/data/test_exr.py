@@ -138,20 +138,6 @@ class TestDecodeExr(BaseTester):
         data = exr(library, {"Z": DEPTH}, comments="é", owner="éé").replace(b"\xc3\xa9", b"\xe9\xe8")
         np.testing.assert_array_equal(decode_exr(data)[0], DEPTH)
 
-    def test_exception_every_cut_is_one_sentence_and_quiet(self, library, capfd):
-        data = exr(library, {"Z": DEPTH})
-        for kept in range(4, len(data) - 1, len(data) // 30):
-            with pytest.raises(ValueError, match=r"^(its OpenEXR is|the file is) cut short or damaged[^\n]*$"):
-                decode_exr(data[:kept])
-        assert capfd.readouterr() == ("", "")
-
-    def test_exception_absurd_sizes_are_refused_by_the_header(self, library):
-        data = exr(library, {"Z": DEPTH})
-        place = data.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
-        huge = data[:place] + np.array([0, 0, 999_999, 999_999], "<i4").tobytes() + data[place + 16 :]
-        with pytest.raises(ValueError, match="the picture has 1000000 x 1000000 pixels, more than"):
-            decode_exr(huge)
-
     def test_exception_many_channels_are_limited_together(self, library, monkeypatch):
         monkeypatch.setenv("KORNIA_TIDY_MAX_PIXELS", str(H * W))
         decode_exr(exr(library, {**colours(names="RGB"), "Z": DEPTH}))

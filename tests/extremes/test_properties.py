@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from torch import Tensor
 
-from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from tests.base import BaseTester
 
 FEW = settings(max_examples=25, derandomize=True)
@@ -95,21 +95,6 @@ class TestLaws(BaseTester):
         moved = [part.roll((down, across), (-2, -1)) for part in scene]
         expected = taken(optics, *scene).roll((down, across), (-2, -1))
         self.assert_close(taken(optics, *moved), expected, atol=TOLERANCE, rtol=0)
-
-    @FEW
-    @given(cameras(), scenes(), st.permutations(range(4)))
-    def test_feature_the_order_of_masks_does_not_matter(self, optics, scene, order):
-        heights = torch.rand(4, 5, 5, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 1e-6
-        times = torch.tensor([1.0, 2.0, 0.0, 3.0])
-        captures = []
-        for where in (list(range(4)), order):
-            shown = TiDyOptics(
-                PixelwiseMask(initial=heights[where]), modulator=DwellTimes(times[where].tolist()), sensor=None,
-                color_space="linear", fidelity=optics.fidelity, compositing=optics.compositing, border=optics.border,
-            )  # fmt: skip
-            captures.append(taken(shown, *scene))
-        # Masks of float32 heights and dwell shares: each PSF is the same, the order of the sum is not.
-        self.assert_close(*captures, atol=1e-6, rtol=0)
 
     @FEW
     @given(cameras(), scenes(), st.integers(-1000, 1000))

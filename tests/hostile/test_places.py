@@ -85,15 +85,6 @@ class TestNames(BaseTester):
         assert os.listdir(folder / "there") == [name]
         assert read_image(folder / "there" / name).shape == (3, 48, 48)
 
-    @pytest.mark.parametrize(
-        "name", ["a" * 300 + ".png", "b/" * 3000 + "c.png", "nul\0.png"], ids=lambda name: name[:3]
-    )
-    def test_exception_names_that_no_disk_holds(self, name, folder):
-        refused(command([word.replace("./in.png", name) for word in SIMULATE], folder))
-        before = sorted(os.listdir(folder))
-        refused(command([word.replace("out.png", name) for word in SIMULATE], folder))
-        assert sorted(os.listdir(folder)) == before
-
 
 class TestDisks(BaseTester):
     @pytest.mark.parametrize("kind", [name for name in WRITERS if name not in {"psf", "train"}])

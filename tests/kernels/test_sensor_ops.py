@@ -132,12 +132,6 @@ class TestSameNoise(BaseTester):
         sensor(torch.full((1, 1, 4, 4), 0.5)).sum().backward()
         assert offset.grad.item() == 16
 
-    def test_feature_transforms_of_torch_func(self):
-        light, uniform = torch.rand(3, 5).double(), torch.rand(3, 5).double()
-        slopes = torch.func.grad(lambda x: record(x, uniform, full_well=900.0).sum())(light)
-        own = light.clone().requires_grad_()
-        self.assert_close(slopes, torch.autograd.grad(record(own, uniform, full_well=900.0).sum(), own)[0])
-
     def test_dynamo(self):
         light, uniform = torch.rand(3, 5, requires_grad=True), torch.rand(3, 5)
         compiled = torch.compile(record, fullgraph=True, backend="aot_eager")

@@ -95,15 +95,6 @@ class TestConversions(BaseTester):
         assert torch.equal(ours(x), theirs(x))
         assert torch.equal(ours(x[:, :1]), theirs(x[:, :1].expand(-1, 3, -1, -1))[:, :1])
 
-    def test_feature_transforms_of_torch_func(self, encode):
-        (ours, theirs), seconds = PAIRS[encode], []
-        x = torch.rand(3, 2, 5, dtype=torch.float64)
-        for function in (ours, theirs):
-            slope = torch.func.grad(lambda x, f=function: f(x).square().sum())
-            seconds.append(torch.func.grad(lambda x, f=slope: f(x).square().sum())(x))
-        self.assert_close(*seconds)
-        self.assert_close(torch.vmap(ours)(x), ours(x))
-
     def test_dynamo(self, encode):
         ours = PAIRS[encode][0]
         compiled = torch.compile(ours, fullgraph=True, backend="aot_eager")

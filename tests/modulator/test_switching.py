@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -125,17 +124,6 @@ class TestRandomStates(BaseTester):
         assert torch.equal(torch.get_rng_state(), before)
         assert not torch.equal(first[3:], Switching(4e-3, seed=1)(phase)[0][3:])
         assert not torch.equal(first[3], first[4])
-
-    @torch.no_grad()
-    def test_feature_another_seed_is_never_stale(self):
-        optics = TiDyOptics(PixelwiseMask(2), modulator=Switching(16e-3), fidelity=SMALL)
-        first = optics.psf_bank().psfs
-        optics.modulator.seed = 1
-        second = optics.psf_bank().psfs
-        assert float((first - second).abs().max()) > 1e-4
-        self.assert_close(pickle.loads(pickle.dumps(optics)).psf_bank().psfs, second, rtol=0, atol=0)
-        optics.modulator.seed = 0
-        self.assert_close(optics.psf_bank().psfs, first, rtol=0, atol=0)
 
     def test_feature_their_mean_field_is_zero(self):
         """A random pattern is the worst state: its mean field, and so its peak, vanishes."""

@@ -90,15 +90,6 @@ class TestFillHoles(BaseTester):
         assert np.shares_memory(fill_holes(depth[0].numpy())[0], depth.numpy())
 
     @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
-    def test_feature_vmap_and_forward_derivatives(self):
-        depth = with_holes(3, 5, 6)
-        assert torch.equal(torch.vmap(fill_holes, 1, 1)(depth.movedim(0, 1))[0].movedim(1, 0), fill_holes(depth)[0])
-        for derive in (torch.func.jacrev, torch.func.jacfwd):
-            found = derive(lambda x: fill_holes(x)[0].sum())(depth)
-            assert found.sum() == depth.numel()  # each pixel's value is that of one known pixel
-            assert (found[depth < 0] == 0).all()
-
-    @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
     def test_dynamo_graph_is_whole(self):
         depth = with_holes(2, 1, 5, 6)
         compiled = torch.compile(fill_holes, backend="eager", fullgraph=True)

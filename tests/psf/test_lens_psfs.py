@@ -284,25 +284,6 @@ class TestLensPSFs(BaseTester):
         bank.psfs.square().sum().backward()
         assert optics.masks.phase.grad is not None
 
-    def test_feature_states_of_cameras_hold_the_lens(self):
-        one = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft")
-        other = TiDyOptics(PixelwiseMask(1), lens="single-50mm", fidelity="draft")
-        other.load_state_dict(one.state_dict())
-        field = [(100.0, 200.0)]
-        self.assert_close(
-            other.psf_bank(defocus=[0.0], field=field).psfs,
-            one.psf_bank(defocus=[0.0], field=field).psfs,
-            atol=1e-6,
-            rtol=0,
-        )
-        ideal = TiDyOptics(PixelwiseMask(1), fidelity="draft")
-        assert "lens._extra_state" in one.state_dict()
-        assert not [key for key in ideal.state_dict() if "lens" in key]
-        one.load_state_dict({"masks.phase": ideal.masks.phase.detach()})  # masks alone leave the lens as it is
-        stopped = TiDyOptics(PixelwiseMask(1), ThinLensCamera(f_number=16), lens="single-50mm", fidelity="draft")
-        with pytest.raises(ValueError, match="the state is that of another camera"):
-            stopped.load_state_dict(one.state_dict())
-
     @pytest.mark.parametrize(
         ("make", "error", "message"),
         [

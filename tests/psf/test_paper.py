@@ -57,12 +57,6 @@ class TestPaperPSFs(BaseTester):
         self.assert_close(bank.energy[:, 2], torch.ones(21), rtol=1e-12, atol=1e-12)
         assert float(bank.energy.max()) <= 1 + 1e-12
 
-    def test_feature_the_crop_colours_depth(self):
-        """A flat white scene: red and green lose light at the ends of the range and blue does not."""
-        energy = bank_of(torch.zeros(1, 23, 23)).energy
-        assert float(energy[0, 0]) < 0.8 * float(energy[10, 0])
-        assert float(energy[0, 2]) == pytest.approx(float(energy[10, 2]))
-
     def test_feature_padded_sides(self):
         assert [padded_size(w) for w in WAVELENGTHS] == [31, 27, 23]
         with pytest.raises(ValueError, match="at least 453 nm, got 400 nm"):

@@ -157,15 +157,6 @@ class TestTails(BaseTester):
         assert float((tails - bank.psfs).abs().sum((2, 3)).max()) <= 2e-3 * (1 + 1e-5)
 
     @torch.no_grad()
-    @pytest.mark.parametrize("method", ["dense", "auto"])
-    def test_feature_white_behind_something_near_stays_white(self, method):
-        psi = torch.zeros(1, 1, 64, 64)
-        psi[..., :32] = 10.0
-        white = torch.ones(1, 3, 64, 64)
-        assert float(render(white, psi, self.discs(), "occlusion", method=method).min()) < 0.6
-        assert float(render(white, psi, self.discs().with_tails(), "occlusion", method=method).min()) > 0.997
-
-    @torch.no_grad()
     def test_feature_a_camera_gives_tails_to_measured_psfs_that_are_cut_for_occlusion(self):
         parts = {"camera": DefocusRange(0.0, 10.0), "sensor": None, "color_space": "linear"}
         depth, image = torch.zeros(1, 1, 64, 64), torch.ones(1, 3, 64, 64)

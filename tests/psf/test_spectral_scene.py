@@ -9,8 +9,6 @@ import torch
 from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, TiDyOptics
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.optics.spectrum import smoothest_reflectances
-from kornia_tidy.psf import PSFBank
-from kornia_tidy.psf.psf_model import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=8.0)
@@ -85,19 +83,6 @@ class TestSpectralScene(BaseTester):
         even = torch.tensor(colour, dtype=torch.float64)[:, None, None].expand_as(scene[0])
         depth = torch.full_like(scene[1], 0.4) if stray_light == "veil" else scene[1]  # a veil is of one depth
         self.assert_close(camera(spectrum, stray_light=stray_light)(even, depth), even, rtol=0, atol=1e-12)
-
-    def test_feature_psfs_alike_at_all_wavelengths_give_the_plain_result(self, spectrum, scene, monkeypatch):
-        optics = camera(spectrum)
-        one = torch.rand(6, 9, 9, dtype=torch.float64) / 90
-
-        def alike(self, light, grid, states, weights, nodes, window, **_):
-            rows = torch.tensor(light.plane_weights, dtype=torch.float64).sum(1)
-            psfs = one[: len(nodes), None] * rows[:, None, None]
-            return PSFBank(psfs, torch.tensor(nodes, dtype=torch.float64), psfs.sum((2, 3)))
-
-        plain = camera(spectrum.flat())
-        monkeypatch.setattr(PSFModel, "_exact_psfs", alike)
-        self.assert_close(optics(*scene), plain(*scene), rtol=0, atol=1e-12)
 
     def test_feature_equals_wavelength_by_wavelength(self, spectrum, scene):
         """The scene as one image for each wavelength, each blurred alone, and seen by the sensor."""

@@ -154,27 +154,3 @@ class TestByName(BaseTester):
     def test_exception_other_shapes(self, name, options, sentence):
         with pytest.raises(ValueError, match=sentence):
             make_head(name, **options)
-
-
-@pytest.mark.usefixtures("transformers")
-class TestFormatOfTransformers(BaseTester):
-    @pytest.fixture(params=KINDS)
-    def name(self, request):
-        return request.param
-
-    def test_feature_a_folder_of_transformers_gives_its_own_depth(self, name, tmp_path, transformers):
-        """Against the network called as transformers documents it, at a size that needs no resizing."""
-        kind, load, multiple, mean = KINDS[name]
-        tiny(name).network.save_pretrained(tmp_path)
-        head = load(tmp_path)
-        assert not head.training
-        head.side = 2 * multiple
-        image = torch.rand(2, 3, 2 * multiple, 3 * multiple)
-        deviation = (0.5, 0.5, 0.5) if name == "zoedepth" else (0.229, 0.224, 0.225)
-        pixels = (image - torch.tensor(mean).view(3, 1, 1)) / torch.tensor(deviation).view(3, 1, 1)
-        with torch.no_grad():
-            network = getattr(transformers, kind).from_pretrained(tmp_path)
-            depth = network.eval()(pixel_values=pixels).predicted_depth[:, None]
-            found = head(image)
-        assert depth.std() > 1e-3 * depth.abs().mean()
-        self.assert_close(found, 1 / depth.clamp(min=1e-3) if name == "zoedepth" else depth)

@@ -178,12 +178,6 @@ class TestReconstructLight(BaseTester):
         _, depth = kornia_tidy.reconstruct(np.full((4, 5), 77, np.uint8), head)
         assert depth.shape == (4, 5)
 
-    def test_feature_the_light_is_left_alone(self):
-        light = torch.rand(3, 12, 14) * 2
-        before = light.clone()
-        reconstruct_light(light_head("joint"), light)
-        assert torch.equal(light, before)
-
     def test_exception_names_the_shape(self):
         with pytest.raises(ValueError, match=r"light must have shape \(3, H, W\) or \(1, H, W\), got \(2, 4, 4\)"):
             reconstruct_light(light_head("edof"), torch.rand(2, 4, 4))

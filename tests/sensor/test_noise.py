@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 import shutil
 
 import numpy as np
@@ -208,18 +206,6 @@ class TestSensorNoise(BaseTester):
         assert gradient_of(sensor, image).isfinite().all()
         if value <= 0:
             assert (out == 0).all()
-
-    def test_feature_nothing_of_a_call_stays_in_the_module(self, device):
-        """No parameters, no buffers, and a pickle of the size of its constants."""
-        sensor = SensorNoise.physical(1000, 2, 3)
-        sensor(torch.rand(1, 3, 64, 64, device=device))
-        assert not sensor.state_dict()
-        assert not list(sensor.parameters())
-        assert len(pickle.dumps(sensor)) < 2000
-        again = copy.deepcopy(pickle.loads(pickle.dumps(sensor)))
-        image = torch.rand(1, 3, 4, 4, device=device)
-        params = sensor.draw(image.shape, device=device)
-        assert torch.equal(again(image, params), sensor(image, params))
 
     def test_feature_it_says_what_it_is(self):
         assert repr(SensorNoise()) == "SensorNoise(read noise 0.01 of full scale, no shot noise, clipped to [0, 1])"

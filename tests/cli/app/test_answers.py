@@ -7,7 +7,7 @@ import torch
 from kornia_tidy.cli.app import answers
 from kornia_tidy.cli.app.answers import KEPT, PICTURES, answer
 from kornia_tidy.cli.app.capture import take_picture
-from kornia_tidy.cli.app.legends import legends, mistake, status
+from kornia_tidy.cli.app.legends import legends, mistake
 from kornia_tidy.cli.app.pictures import masks_and_psfs, photograph
 from kornia_tidy.cli.app.settings import Settings
 from kornia_tidy.data import write_depth, write_image
@@ -99,12 +99,6 @@ class TestLegends(BaseTester):
         assert f"by the network of joint-uncertain. PSNR {scores['image_psnr']:.1f} dB" in words["image"]
         assert f"RMSE {scores['depth_rmse']:.2f} of the range" in words["estimate"]
         assert f"{trained.optics.window} x {trained.optics.window} pixels" in words["psfs"]
-
-    def test_feature_many_pixels_beyond_the_range_are_told(self, trained):
-        assert "beyond" not in status(trained, 1.0)
-        far = take_picture(Settings(camera="ikoma2021", stretch=False, near=0.5, far=0.9, **SMALL))
-        assert "**100 % of the pixels lie beyond these depths**" in status(far, 1.0)
-        assert "depths from 0.297 m to infinity. Computed in 1.2 s" in status(trained, 1.23)
 
     @pytest.mark.parametrize(
         ("error", "sentence"),

@@ -10,7 +10,6 @@ from safetensors.torch import save_file
 from kornia_tidy import Fidelity, NoMask, PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data.image_files import read_image
-from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 from tests.optics.lens.written_files import doublet, zemax
 
@@ -79,19 +78,6 @@ class TestPsf(BaseTester):
             assert percent[1] == pytest.approx(100 * float(own.sum() / light), abs=0.06)
             assert percent[2] == pytest.approx(100 * float(own.max() / light), abs=0.006)
         assert read_image(path).shape[2] == 1280
-
-    @pytest.mark.takes_seconds
-    def test_feature_masks_stand_in_a_named_lens_and_in_that_of_a_file(self, tmp_path, capsys):
-        lens = Lens.named("single-50mm", 17.6, 0.595)
-        lens.save(tmp_path / "lens.safetensors")
-        rest = ["--field", "1", "--depths", "0.595", "--fidelity", "draft", "-o", str(tmp_path / "a.png")]
-        options = ["--f-number", "17.6", "--focus-distance", "0.595"]
-        assert main(["psf", "tidy-5", "--lens", "single-50mm", *options, *rest]) == 0
-        named = rows(capsys.readouterr().out)
-        assert main(["psf", "tidy-5", "--lens", str(tmp_path / "lens.safetensors"), *rest]) == 0
-        assert rows(capsys.readouterr().out) == named
-        assert main(["psf", "--lens", "single-50mm", *rest]) == 0
-        assert rows(capsys.readouterr().out) != named
 
     @pytest.mark.parametrize(
         ("words", "sentence"),

@@ -61,13 +61,6 @@ class TestRawDevelop(BaseTester):
         self.assert_close(read_image(tmp_path / "c.png"), expected.clamp(0, 1), atol=1 / 65535)
         assert not (tmp_path / "c.jpg").exists()
 
-    def test_feature_sensor_grid_is_neither_turned_nor_stretched(self, tmp_path):
-        counts = np.random.default_rng(0).integers(64, 1000, (30, 40))
-        (tmp_path / "turned.dng").write_bytes(dng(counts, orientation=6, extra={50718: (5, [1.5, 1.0])}))
-        for options, shape in (([], (3, 60, 30)), (["--sensor-grid"], (3, 30, 40))):
-            assert main(["raw", "develop", str(tmp_path / "turned.dng"), "-o", str(tmp_path), *options]) == 0
-            assert read_image(tmp_path / "turned.png").shape == shape
-
     def test_feature_dump_with_its_levels(self, tmp_path):
         counts = np.random.default_rng(0).integers(100, 900, (24, 30)).astype("<u2")
         (tmp_path / "dump.raw").write_bytes(counts.tobytes())

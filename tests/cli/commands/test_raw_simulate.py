@@ -1,19 +1,14 @@
 from __future__ import annotations
 
-import json
-
 import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data import read_image, read_rgbd, write_depth, write_image
+from kornia_tidy.data import read_rgbd, write_image
 from kornia_tidy.lab.calibration.noise import PhotonTransfer
 from kornia_tidy.lab.calibration.noise.photon_transfer import TransferLine, write_json
 from kornia_tidy.lab.raw import RawCapture, develop, simulate_scene
-from kornia_tidy.optics import Lens
-from kornia_tidy.reconstruction.camera_system import any_camera_system
-from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from tests.base import BaseTester
 
 SCENE = ["raw", "simulate", "--image", "image.png", "--depth", "depth.pfm", "--fidelity", "draft", "--masks", "1"]
@@ -86,29 +81,6 @@ class TestThereAndBack(BaseTester):
     """`raw simulate` and `raw reconstruct` with the same lens and masks."""
 
     CAMERA = ("--masks", "1", "--f-number", "12", "--focus-distance", "0.65", "--depth-range", "0.5", "0.8")
-
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize(("head", "lens"), [("wiener", "single-50mm"), (None, "own.safetensors")])
-    def test_feature_a_capture_behind_a_real_lens_is_restored_as_in_python(self, scene, head, lens, capsys):
-        made = Lens.named("single-50mm", 12.0, 0.65)
-        made.save("own.safetensors")
-        write_depth("depth.pfm", torch.full((1, 72, 80), 0.65))
-        words = self.CAMERA if lens == "single-50mm" else ("--masks", "1", "--depth-range", "0.5", "0.8")
-        assert main([*SCENE, *words, "--lens", lens, "-o", "shot.dng"]) == 0
-        command = ["raw", "reconstruct", "shot.dng", *words, "--lens", lens, "--noise", "0.003", "-o", "sharp"]
-        command += [] if head is None else ["--head", head]
-        assert main(command) == 0
-        assert "50 mm f/12, focus at 0.65 m" in capsys.readouterr().out
-        masks, sensor = PixelwiseMask(1, generator=seeded(0)), SensorNoise(0.003)
-        optics = TiDyOptics(masks, made.camera(8e-6, (0.5, 0.8)), lens=made, sensor=sensor)
-        system = any_camera_system(optics) if head is None else any_camera_system(optics, head=head)
-        light = develop(RawCapture.open("shot.dng"), encoded=False)
-        wanted, found = reconstruct_light(LightHead(system), light).image, read_image("sharp/shot.png")
-        self.assert_close(found, wanted, rtol=0, atol=1e-3)
-        self.assert_close(found.mean(), read_image("image.png").mean(), rtol=0, atol=0.05)
-        assert main([*command, "--resume"]) == 0
-        assert "kept" in capsys.readouterr().out
-        assert json.loads((scene / "sharp" / "shot.json").read_text())["settings"]["camera"]["lens"] == lens
 
     def test_feature_the_lens_is_traced_to_the_corner_of_the_first_file_that_is_there(self, scene, capsys):
         write_image("wide.png", torch.rand(3, 40, 1800))

@@ -145,14 +145,6 @@ class TestReadResponse(BaseTester):
             read_response(tmp_path / "lut.csv", bits)
         assert len(str(told.value).replace(str(tmp_path), "")) < 260
 
-    @pytest.mark.timeout(20)
-    @pytest.mark.parametrize(
-        "text", ["lut " * 10**5 + "\n0\n3", "mod" * 10**5 + "\n0\n3", "0;0\n1;3" + " " * 10**5 + ";"]
-    )
-    def test_feature_long_lines_take_no_longer_than_reading_them(self, text, tmp_path):
-        (tmp_path / "lut.csv").write_text(text)
-        assert read_response(tmp_path / "lut.csv", 1) == [0, 3]
-
     @pytest.mark.parametrize("unit", [math.pi, 2 * math.pi])
     def test_feature_units_that_no_header_names_are_told(self, unit, tmp_path):
         (tmp_path / "lut.csv").write_text("\n".join(f"{g},{p / unit:.5f}" for g, p in enumerate(PLAIN)))

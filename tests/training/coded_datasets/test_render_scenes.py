@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import shutil
 import tarfile
-from pathlib import Path
 
 import pytest
 import torch
@@ -84,20 +83,6 @@ class TestRenderScenes(BaseTester):
         assert kept.stat().st_mtime_ns == touched
         assert contents(tmp_path) == contents(folder)
         assert not list(tmp_path.glob(".*"))
-
-    def test_feature_another_process_may_begin_while_this_one_does(self, whole, tmp_path, monkeypatch):
-        folder, layout = whole
-        exists, others = Path.exists, iter(range(1))
-
-        def late(path, **options):
-            there = exists(path, **options)
-            if path.name == "render.json" and next(others, None) is not None:
-                render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=1, world=2)
-            return there
-
-        monkeypatch.setattr(Path, "exists", late)
-        render_scenes(small_camera(), small_scenes(), tmp_path, layout, seed=7, rank=0, world=2)
-        assert contents(tmp_path) == contents(folder)
 
     def test_feature_scenes_of_tensors_that_draw_at_random(self, tmp_path):
         """Without mask or name, drawn from the global generator: the same whoever renders which, and nobody's draws."""

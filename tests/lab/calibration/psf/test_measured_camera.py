@@ -18,7 +18,7 @@ from kornia_tidy.reconstruction.layered_joint import REFINED_FROM
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.trained import update_psfs
 from tests.base import BaseTester
-from tests.measured import DISTANCES, LENS, measured_psfs
+from tests.measured import LENS, measured_psfs
 
 SENSOR = SensorNoise.physical(10500, 2.4)
 
@@ -80,17 +80,6 @@ class TestMeasuredCamera(BaseTester):
             for head in heads.values():
                 update_psfs(head, optics)
                 assert head.eval()(scene[0]).isfinite().all()
-
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    @pytest.mark.parametrize("border", ["reflect", "valid", "zero"])
-    def test_feature_a_plan_takes_what_was_measured(self, psfs, scene, compositing, border):
-        optics = measured_camera(psfs, sensor=None, compositing=compositing, border=border)
-        plan = optics.plan(scene[1], tolerance=1e-6)
-        assert (plan.predicted_error, plan.fidelity.window) == (0.0, psfs.bank.window)
-        assert plan.layers[0] <= plan.layers[1] == len(DISTANCES)
-        assert plan.operations > 0
-        assert "measured PSFs" in str(plan)
-        assert torch.equal(optics(*scene), optics.with_fidelity(plan.fidelity)(*scene))
 
     def test_feature_one_distance_is_a_camera_too(self):
         optics = measured_camera(measured_psfs(distances=(0.8,)))
