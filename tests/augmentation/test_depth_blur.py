@@ -89,11 +89,6 @@ class TestDepthBlur(BaseTester):
         gathered = depth_blur(image, torch.full_like(depth, 0.9), 0.6, 2.0, **LENS)
         self.assert_close(blurred, gathered, atol=1e-4)  # one layer looks alike
 
-    def test_feature_the_largest_disc_is_the_limit(self):
-        image, depth = torch.rand(1, 3, 30, 30), torch.full((1, 1, 30, 30), 0.2)
-        near = depth_blur(image, depth, 0.6, 0.95, max_radius=3.0, **LENS)
-        self.assert_close(near, depth_blur(image, depth * 0.9, 0.6, 0.95, max_radius=3.0, **LENS))
-
     def test_exception(self):
         image, depth = scene(1)
         with pytest.raises(ValueError, match=r"focus_distance must be beyond the focal length 0.05 m, got 0.04"):

@@ -96,14 +96,6 @@ class TestDistorted(BaseTester):
         self.assert_close(seen, image, rtol=0, atol=1e-4)
         assert torch.equal(there, depth.expand(2, -1, -1, -1))
 
-    def test_cardinality(self, dtype):
-        optics = camera(Lens.named("single-50mm", 17.6, 0.595))
-        image, depth = torch.rand(3, 33, 40, dtype=dtype), torch.ones(1, 33, 40)
-        seen, there = distorted(optics, image, depth)
-        assert (seen.shape, seen.dtype, there.shape, there.dtype) == (image.shape, dtype, depth.shape, depth.dtype)
-        grey, _ = distorted(optics, image[:1], depth)
-        assert grey.shape == (1, 33, 40)
-
     def test_gradcheck(self):
         optics = camera(Lens.from_seidel(50e-3, 17.6, 0.595, 4e-3, distortion=0.05))
         image, depth = torch.rand(1, 3, 9, 9, dtype=torch.float64), torch.ones(1, 1, 9, 9)

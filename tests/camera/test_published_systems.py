@@ -123,13 +123,6 @@ class TestFromPreset(BaseTester):
         with pytest.raises(TypeError, match="unexpected keyword argument 'mask'"):
             preset("tidy-1", mask=None)
 
-    @pytest.mark.parametrize("name", ["tidy-5", "tidy-1", "ikoma2021", "liu2022-pixelwise"])
-    def test_feature_a_seed_gives_the_same_masks_again(self, name):
-        first, again = preset(name).masks.phase, preset(name).masks.phase
-        other = TiDyOptics.from_preset(name, generator=torch.Generator().manual_seed(1)).masks.phase
-        assert torch.equal(first, again)
-        assert not torch.equal(first, other)
-
     def test_feature_overrides_replace_parts_and_nothing_else(self):
         optics = preset("ikoma2021", masks=PixelwiseMask(2, 30), sensor=None)
         assert optics.pupil.amplitude.shape == (30, 30)  # the iris follows the mask's pixels

@@ -87,19 +87,6 @@ class TestPhotoCollage(BaseTester):
         assert light.mean(0).std() > 0.01
         assert (light[0] / light[2]).std() > 0.01
 
-    @pytest.mark.parametrize(("reduction", "draws"), [((1.0, 1.0), (0, 0, 0, 1)), ((1.0, 1.0), (0.3, 1, 0.5, 1))])
-    def test_feature_a_part_that_is_not_reduced_is_that_of_the_file(self, reduction, draws, tmp_path, monkeypatch):
-        """At two samples a pixel and a reduction of one, a sample is half a pixel of the file: enlarged twice."""
-        monkeypatch.setattr(module, "REDUCTION", (2.0 * reduction[0], 2.0 * reduction[1]))
-        stored = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8)
-        assert cv2.imwrite(str(tmp_path / "a.png"), stored[..., ::-1])
-        light = rgb_to_linear_rgb(torch.from_numpy(stored.transpose(2, 0, 1))[None] / 255)[0].numpy()
-        top, left = round(draws[1] * 20), round(draws[2] * 24)
-        part = light[:, top : top + 10, left : left + 16].transpose(1, 2, 0)
-        self.assert_close(_cut(tmp_path / "a.png", 10, 16, np.array(draws)), part, rtol=0, atol=1e-6)
-        mirrored = _cut(tmp_path / "a.png", 10, 16, np.array((*draws[:3], 0.2)))
-        self.assert_close(np.ascontiguousarray(mirrored), np.ascontiguousarray(part[:, ::-1]), rtol=0, atol=1e-6)
-
     def test_feature_photographs_are_reduced_and_smaller_ones_enlarged(self, tmp_path, monkeypatch):
         """Across a ramp of light whose slope tells the scale."""
         ramp = np.tile(np.linspace(0, 60000, 300)[None, :, None], (200, 1, 3)).astype(np.uint16)

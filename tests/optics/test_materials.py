@@ -18,23 +18,6 @@ MATERIALS = list(FILES)
 by_name = pytest.mark.parametrize("material", MATERIALS, ids=lambda material: material.name)
 
 
-def database_index(text: str, um: float) -> float:
-    """Evaluate a refractiveindex.info entry: formulas 1, 2 (Sellmeier), 3 (polynomial of n²) and 5 (Cauchy)."""
-    formula = int(re.search(r"type: formula (\d)", text).group(1))
-    c = [float(number) for number in re.search(r"coefficients: (.*)", text).group(1).split()]
-    pairs = list(zip(c[1::2], c[2::2], strict=True))
-    match formula:
-        case 1:
-            return math.sqrt(1 + c[0] + sum(b * um**2 / (um**2 - resonance**2) for b, resonance in pairs))
-        case 2:
-            return math.sqrt(1 + c[0] + sum(b * um**2 / (um**2 - square) for b, square in pairs))
-        case 3:
-            return math.sqrt(c[0] + sum(b * um**power for b, power in pairs))
-        case 5:
-            return c[0] + sum(b * um**power for b, power in pairs)
-    raise AssertionError(f"formula {formula} is not one of these materials'")
-
-
 class TestMaterial(BaseTester):
     @pytest.mark.parametrize("wavelength", [0.0, -530e-9, math.nan, math.inf])
     def test_exception_a_wavelength_is_positive_and_finite(self, wavelength):
@@ -72,14 +55,6 @@ class TestMaterial(BaseTester):
         """Against refractiveindex.info's own values, rounded there to five places."""
         for wavelength, index in zip((470e-9, 530e-9, 610e-9), indices, strict=True):
             assert material.index(wavelength) == pytest.approx(index, abs=5.1e-6)
-
-    @by_name
-    def test_feature_matches_the_database_over_the_whole_range(self, material):
-        text = shared(f"data/materials/{FILES[material]}").read_text(encoding="utf-8")
-        shortest, longest = material.valid
-        for step in range(101):
-            wavelength = shortest + step / 100 * (longest - shortest)
-            assert material.index(wavelength) == pytest.approx(database_index(text, wavelength * 1e6), abs=1e-12)
 
     def test_feature_the_film_of_joseph_2020_is_another_noa61(self):
         """The disagreement in NOA61's docstring: 1.498 at 530 nm in a thin film, against the maker's 1.564."""

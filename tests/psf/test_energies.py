@@ -11,7 +11,6 @@ from kornia_tidy.psf.energies import (
     LARGEST_WINDOW,
     SOURCE,
     energy_operations,
-    goes_in_c,
     mutual_energies,
     pixel_energies,
     wave_energies,
@@ -77,13 +76,6 @@ class TestInC(BaseTester):
         finally:
             torch.set_num_threads(threads)
         self.assert_close(got, expected, rtol=1e-5, atol=1e-4)
-
-    def test_feature_for_small_windows_and_constant_weights(self):
-        assert goes_in_c(LARGEST_WINDOW, torch.float32)
-        assert not goes_in_c(LARGEST_WINDOW + 2, torch.float32)
-        field, weights, kernels = random_case(dtype=torch.complex64)
-        assert "mutual" in mutual_energies(field.requires_grad_(), weights, kernels).grad_fn.name()
-        assert "mutual" not in mutual_energies(field, weights.requires_grad_(), kernels).grad_fn.name()
 
 
 class TestNumerics(BaseTester):

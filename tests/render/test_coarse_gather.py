@@ -100,13 +100,6 @@ class TestGatherGroup(BaseTester):
         seen = torch.full((1, 1, 90, 101), 250.0)
         assert gather_group(torch.rand(2, 1, 90, 101), seen, coarse, "valid").shape == (2, 1, 20, 31)
 
-    def test_feature_few_layers_at_a_time_change_nothing(self, monkeypatch):
-        group, one = group_of((24.0, 26.0, 28.0, 31.0, 34.0), 2), light(64)
-        psi = torch.linspace(defocus_of(24.0), defocus_of(34.0), 64).expand(1, 1, 64, 64)
-        whole = gather_group(one, psi, group)
-        monkeypatch.setattr("kornia_tidy.render.coarse_gather._LAYER_BYTES", 1)
-        self.assert_close(gather_group(one, psi, group), whole, rtol=0, atol=1e-6)
-
     @pytest.mark.parametrize("aperture", ["disc", "ring", "triangle"])
     def test_feature_light_is_never_below_the_bound(self, aperture):
         """The worst light is white where the kernel is negative; a point of light is the worst for its energy."""

@@ -207,12 +207,6 @@ class TestSensorNoise(BaseTester):
         if value <= 0:
             assert (out == 0).all()
 
-    def test_feature_it_says_what_it_is(self):
-        assert repr(SensorNoise()) == "SensorNoise(read noise 0.01 of full scale, no shot noise, clipped to [0, 1])"
-        assert repr(SensorNoise(0.0, full_well=900, dark=2.5, bits=8, clip=False)) == (
-            "SensorNoise(no read noise, full well 900 electrons, dark signal 2.5 electrons, 8 bits, not clipped)"
-        )
-
     @given(
         hnp.arrays(
             np.float32, hnp.array_shapes(min_dims=4, max_dims=4, max_side=3), elements=st.floats(-1e6, 1e6, width=32)

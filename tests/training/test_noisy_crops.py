@@ -93,14 +93,6 @@ class TestNoiseFreeCaptures(BaseTester):
         self.assert_close(capture.inverse_depth, depth, rtol=0, atol=step)
         assert capture.mask.all()
 
-    def test_feature_a_scene_is_rendered_once_and_read_from_its_file_afterwards(self, tmp_path, monkeypatch):
-        scenes, optics, calls = DeadLeaves(2, SIDE, SIDE), camera(), []
-        first = NoiseFreeCaptures(scenes, optics, tmp_path)[1]
-        monkeypatch.setattr(NoiseFreeCaptures, "_render", lambda *args: calls.append(args))
-        again = NoiseFreeCaptures(scenes, optics, tmp_path)[1]
-        assert not calls
-        assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
-
     def test_exception_captures_of_another_camera_or_of_other_scenes(self, tmp_path):
         NoiseFreeCaptures(Points(), camera(), tmp_path, {"seed": 0})
         NoiseFreeCaptures(Points(), camera(sigma=0.3), tmp_path, {"seed": 0})  # the sensor does not matter

@@ -16,7 +16,6 @@ from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
 
-from kornia_tidy.training.callbacks import drop_rows_after
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 from kornia_tidy.training.run import train
@@ -195,9 +194,3 @@ class TestTrain(BaseTester):
             train(SETTINGS, tmp_path)
         with pytest.raises(ValueError, match=r"other settings \(stored / asked for\): lr \(0.01 / 0.1\)$"):
             train(SETTINGS.replace(lr=0.1), tmp_path, resume=True)
-
-    def test_feature_lines_of_steps_to_be_taken_again_are_dropped(self, tmp_path):
-        path = tmp_path / "a.csv"
-        path.write_text("epoch,step,loss\n0,1,0.5\n0,2,0.4\n0,3,0.3\n0,")
-        drop_rows_after(path, 2)
-        assert path.read_text().split() == ["epoch,step,loss", "0,1,0.5", "0,2,0.4"]
