@@ -54,7 +54,7 @@ def read_depth(
     to a pixel x, y from the middle of the image, :math:`z = s v f / \sqrt{f^2 + x^2 + y^2}`.
 
     Args:
-        path: a PNG, TIFF, PGM, PFM, NPY, NPZ, HDF5 or OpenEXR file. It has one channel, and an array is (H, W) and
+        path: a PNG, TIFF, PGM, PAM, PFM, NPY, NPZ, HDF5 or OpenEXR file. It has one channel, and an array is (H, W) and
             is never unpickled; an NPZ archive and an HDF5 file hold one array; see
             :func:`~kornia_tidy.data.exr.decode_exr` for the channel of an OpenEXR file.
         scale: s, metres or pixels of disparity per stored unit; 0.001 for millimetres, where other programs say 1000

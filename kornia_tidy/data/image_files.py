@@ -26,7 +26,7 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     """Read a picture as a tensor in [0, 1].
 
     Args:
-        path: an 8- or 16-bit PNG, TIFF, JPEG, BMP, WebP, PGM or PPM, or a TIFF, PFM, NPY or NPZ of floats
+        path: an 8- or 16-bit PNG, TIFF, JPEG, BMP, WebP, PBM, PGM, PPM or PAM, or a TIFF, PFM, NPY or NPZ of floats
             that lie in [0, 1]. An array has the layout (H, W) or (H, W, C) with channels R, G, B, and is never
             unpickled; an NPZ archive holds one.
 
@@ -44,7 +44,7 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
             orientation.
 
     Convention:
-        - Alpha is dropped. Integers are divided by the maximum that a PGM or PPM file gives, else by the largest
+        - Alpha is dropped. Integers are divided by the maximum that a PGM, PPM or PAM file gives, else by the largest
           of their bits.
         - A TIFF holds one picture, of 1 to 16 bits, and is read as :func:`~kornia_tidy.data.tiff.decode_tiff` says.
         - The orientation is not applied: a depth map of the same camera has none, and calibrations refer to the pixels

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from operator import itemgetter
@@ -33,6 +34,7 @@ _TAG = 0x0112
 _APP1, _START_OF_SCAN = 0xE1, 0xDA
 _EXIF, _XMP = b"Exif\0\0", b"ns.adobe.com/xap/1.0/\0"
 _XMP_TURN = re.compile(rb"""tiff:Orientation(?:\s*=\s*["']|>)\s*([1-8])\s*[<"']""")
+_LONGEST = 1 << 20  # bytes of a compressed text that are unfolded
 
 
 def orientation_of(data: bytes) -> int:
@@ -121,8 +123,29 @@ def _jpeg(data: bytes) -> Iterator[bytes]:
 
 def _png(data: bytes) -> Iterator[bytes]:
     for kind, begin, end in png_chunks(data):
-        if kind == b"eXIf" or (kind == b"iTXt" and data.startswith(b"XML:com.adobe.xmp\0", begin)):
+        if kind == b"eXIf":
             yield data[begin:end]
+        elif kind in {b"tEXt", b"zTXt", b"iTXt"}:
+            keyword, _, text = data[begin:end].partition(b"\0")
+            if keyword == b"XML:com.adobe.xmp":
+                yield text
+            elif keyword in {b"Raw profile type exif", b"Raw profile type APP1", b"Raw profile type xmp"}:
+                yield _profile(_unfolded(text[1:]) if kind == b"zTXt" else text)
+
+
+def _profile(text: bytes) -> bytes:
+    """Return the bytes of a profile as ImageMagick writes it: name, length and hexadecimal digits."""
+    try:
+        return bytes.fromhex(b"".join(text.split()[2:]).decode("ascii"))
+    except ValueError:
+        return b""
+
+
+def _unfolded(packed: bytes) -> bytes:
+    try:
+        return zlib.decompressobj().decompress(packed, _LONGEST)
+    except zlib.error:
+        return b""
 
 
 def _webp(data: bytes) -> Iterator[bytes]:

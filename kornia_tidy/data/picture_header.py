@@ -18,7 +18,7 @@ from typing import NamedTuple
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = 1 << 28  # pixels
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
-FORMATS = "PNG, JPEG, TIFF, PGM, PPM, PFM, BMP, WebP, NPY or NPZ, and for depth OpenEXR or HDF5"
+FORMATS = "PNG, JPEG, TIFF, PBM, PGM, PPM, PAM, PFM, BMP, WebP, NPY or NPZ, and for depth OpenEXR or HDF5"
 
 OTHERS = (
     (0, b"GIF8", "GIF"), (4, b"ftyphei", "HEIF"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavi", "AVIF"),
@@ -26,7 +26,6 @@ OTHERS = (
     (0, b"\xff\x4f\xff\x51", "JPEG 2000"), (0, b"#?R", "Radiance HDR"), (0, b"8BPS", "Photoshop"),
     (0, b"DDS ", "DDS"), (0, b"%PDF", "PDF"), (0, b"<svg", "SVG"), (0, b"<?xml", "XML"), (0, b"Ph", "a PFM of halves"),
     (0, b"PH", "a PFM of halves"), (0, b"PK\5\6", "an empty ZIP"), (0, b"SIMPLE  =", "FITS"), (0, b"MATLAB", "MATLAB"),
-    (0, b"P1", "PBM"), (0, b"P4", "PBM"), (0, b"P7\n", "PAM"),
 )  # fmt: skip
 """Kinds of files that are not read: where they begin, with what, and their name."""
 

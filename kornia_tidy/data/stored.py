@@ -51,7 +51,7 @@ class Stored(NamedTuple):
 def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
     """Read the numbers in a picture or depth file, without any conversion.
 
-    The format is recognised by content, not by name: PNG, TIFF, JPEG, PGM, PPM, PFM, BMP, WebP, NPY, NPZ,
+    The format is recognised by content, not by name: PNG, TIFF, JPEG, PBM, PGM, PPM, PAM, PFM, BMP, WebP, NPY, NPZ,
     HDF5 or OpenEXR. The size in the header is checked before decoding, see
     :func:`~kornia_tidy.data.picture_header.check_pixels` for the limit. The orientation is reported, not applied: depth
     maps and calibrations refer to the pixels of the sensor.
@@ -115,6 +115,8 @@ def _decode(data: bytes, depth: bool) -> Stored:
         values, unknown = decode_exr(data)
         return Stored(values, unknown=unknown)
     if data.startswith(NETPBM):
+        if depth and data.startswith((b"P1", b"P4")):
+            raise ValueError("it is a bitmap (PBM) of black and white, which is no depth")
         return Stored(*decode_netpbm(data))
     if data.startswith(TIFF):
         return Stored(*decode_tiff(data, depth))

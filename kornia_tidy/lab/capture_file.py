@@ -20,7 +20,7 @@ from kornia_tidy.lab.raw.developed_noise import developed_noise
 from kornia_tidy.sensor.sensor import SensorNoise
 
 PICTURES = (
-    ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".bmp", ".webp",
+    ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".npy", ".npz", ".pfm", ".pgm", ".ppm", ".pam", ".bmp", ".webp",
 )  # fmt: skip
 """Suffixes of files that are pictures; others are raw files."""
 

@@ -58,6 +58,7 @@ def riff(*chunks):
 
 XMP = b'<x:xmpmeta><rdf:Description tiff:Orientation="6"/></x:xmpmeta>'
 XMP_ELEMENT = b"<x:xmpmeta><tiff:Orientation>6</tiff:Orientation></x:xmpmeta>"
+PROFILE = b"\nexif\n      42\n" + (b"Exif\0\0" + exif(6)).hex().encode() + b"\n"
 
 
 def carriers():
@@ -80,6 +81,8 @@ def carriers():
     for name, part in {
         "eXIf": chunk(b"eXIf", exif(6, ">")),
         "eXIf with a prefix": chunk(b"eXIf", app1 + exif(6)),
+        "tEXt": chunk(b"tEXt", b"Raw profile type exif\0" + PROFILE),
+        "zTXt": chunk(b"zTXt", b"Raw profile type exif\0\0" + zlib.compress(PROFILE)),
         "iTXt": chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + XMP),
     }.items():
         yield f"PNG {name}", png[:33] + part + png[33:]

@@ -139,6 +139,7 @@ PICTURES = {
     "JPEG": lambda: jpeg(65_535, 65_535),
     "PPM": lambda: b"P6\n1000000 1000000\n255\n" + bytes(99),
     "PGM, plain": lambda: b"P2 1000000 1000000 255\n" + b"0 " * 99,
+    "PAM": lambda: b"P7\nWIDTH 16000\nHEIGHT 16000\nDEPTH 1000000\nMAXVAL 255\nTUPLTYPE RGB\nENDHDR\n" + bytes(99),
     "NPZ": lambda: npz((HUGE, HUGE), 0),
     "NPZ, compressed": lambda: npz((1 << 15, 1 << 14), 1 << 29),
     "NPZ, compressed more than promised": lambda: npz((2, 2), 1 << 29),

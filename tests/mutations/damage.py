@@ -213,6 +213,17 @@ def text_header(data: bytes, generator: Generator) -> bytes:
     return b"\n".join([words[0], b" ".join(words[1:-1]), words[-1], lines[3] if len(lines) > 3 else b""])
 
 
+def pam_line(data: bytes, generator: Generator) -> bytes:
+    """A line of the header of a PAM file is another, is missing, or is there twice."""
+    lines = data.split(b"ENDHDR\n")[0].split(b"\n")
+    place = int(generator.integers(1, len(lines)))
+    name = pick(generator, (b"WIDTH", b"HEIGHT", b"DEPTH", b"MAXVAL", b"TUPLTYPE", b"#", b"", b"WIDE"))
+    words = (b"0", b"-1", b"1", b"4", b"255", b"256", b"65535", b"65536", b"99999999999", b"RGB", b"CMYK", b"", b"\xff")
+    new = [name + b" " + bytes(pick(generator, words))]
+    changed = [*lines[:place], *(new if generator.random() < 0.8 else []), *lines[place + int(generator.integers(2)) :]]
+    return b"\n".join(changed) + data[len(b"\n".join(lines)) :]
+
+
 def tensors_header(data: bytes, generator: Generator) -> bytes:
     """The JSON that a safetensors file begins with, damaged in its structure, under the right length."""
     (size,) = struct.unpack_from("<Q", data)
@@ -277,6 +288,7 @@ BY_KIND: dict[str, tuple[Damage, ...]] = {
     "tiff": (tiff_field,),
     "jpeg": (jpeg_segment,),
     "pfm": (text_header,),
+    "pam": (pam_line,),
     "safetensors": (tensors_header,),
     "checkpoint": (tensors_header, stored_state, stored_state),
     "json": (json_structure, json_structure, json_text),

@@ -66,6 +66,8 @@ def _write_pictures(folder: Path) -> None:
     for suffix in ("png", "pfm", "npy"):
         write_depth(folder / f"depth.{suffix}", depth.clamp(max=60), 0.001 if suffix == "png" else 1.0, saturate=True)
     cv2.imwrite(str(folder / "depth.tif"), depth[0].numpy())
+    head = f"P7\nWIDTH {SIZE}\nHEIGHT {SIZE}\nDEPTH 3\nMAXVAL 1023\nTUPLTYPE RGB\nENDHDR\n".encode()
+    (folder / "image.pam").write_bytes(head + np.rint(1023 * rows).astype(">u2").tobytes())
     np.savez_compressed(folder / "depth.npz", depth[0].numpy())
     with suppress(ImportError):  # an extra
         import OpenEXR

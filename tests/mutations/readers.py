@@ -59,7 +59,7 @@ SHARES = {
 TIFFS = 150
 """Combinations of properties that are damaged."""
 
-KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "bmp", "webp", "hdf5", "exr"}
+KINDS = {"png", "tiff", "jpeg", "pfm", "npy", "npz", "ppm", "pam", "bmp", "webp", "hdf5", "exr"}
 """Of pictures and depth."""
 
 
@@ -83,6 +83,7 @@ def _pictures(folder: Path) -> list[Case]:
     cv2.imwrite(str(folder / "image.pgm"), rows[..., 0])
     cv2.imwrite(str(folder / "plain.ppm"), rows, [cv2.IMWRITE_PXM_BINARY, 0])
     height, width = rows.shape[:2]
+    (folder / "image.pbm").write_bytes(f"P1 {width} {height}\n".encode() + (rows[..., 0] // 128 + 48).tobytes())
     np.savez(folder / "image.npz", image=rows)
     depth = np.load(folder / "depth.npy")
     (folder / "depth.pgm").write_bytes(f"P2\n{width} {height}\n999\n".encode() + b" ".join(
@@ -94,7 +95,7 @@ def _pictures(folder: Path) -> list[Case]:
         file.create_dataset("dataset", data=depth)
     cases = []
     for path in sorted(folder.iterdir()):
-        kind = {".tif": "tiff", ".jpg": "jpeg", ".pgm": "ppm"}.get(path.suffix, path.suffix[1:])
+        kind = {".tif": "tiff", ".jpg": "jpeg", ".pgm": "ppm", ".pbm": "ppm"}.get(path.suffix, path.suffix[1:])
         if kind not in KINDS or path.stem == "heights":
             continue
         damage = {"ppm": "pfm", "bmp": "raw", "webp": "raw"}.get(kind, kind)
