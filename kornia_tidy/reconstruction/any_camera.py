@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from kornia_tidy.reconstruction.closed_form import closed_form_channels
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
@@ -135,24 +133,3 @@ def corrected(image: Tensor, maps: Tensor, largest: Tensor | float = 1.0) -> Ten
         tensor([0.1000, 0.2000, 0.3000])
     """
     return image + largest * maps[:, :1].sigmoid() * maps[:, 1:]
-
-
-def from_one_camera(weights: Mapping[str, Tensor], head: AnyCameraHead) -> dict[str, Tensor]:
-    """Return the weights of a network that was trained with one camera as a start for one of any camera.
-
-    Weights of the maps that tell of the camera are zero, and the share is the same everywhere.
-
-    Args:
-        weights: state of the network of a :class:`~kornia_tidy.reconstruction.ClosedFormHead` with as many layers,
-            blocks and channels, without fine maps.
-        head: it is not changed.
-
-    Returns:
-        A state for ``head.network``.
-    """
-    found = dict(weights)
-    found["first.weight"] = functional.pad(weights["first.weight"], (0, 0, 0, 0, 0, CAMERA_MAPS))
-    last, bias = weights["last.weight"], weights["last.bias"]
-    found["last.weight"] = torch.cat([torch.zeros_like(last[:1]), last])
-    found["last.bias"] = torch.cat([bias.new_full((1,), SHARE), bias])
-    return found

@@ -37,7 +37,7 @@ NOISES = tuple(WIENER_NOISES[0] * 10 ** (STEP * i) for i in range(-FINER, 0)) + 
 TIKHONOV = (3e-2, 1e-2, 3e-3, 1e-3)  # weights of the filters that follow, whose inverses of wide PSFs are cut less
 FILTERS = len(NOISES) + len(TIKHONOV)
 BEFORE_BILATERAL = 0.3  # of the variance of noise: how much the kernel takes it for, as a bilateral filter follows
-CONTENT = (0.03, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
+CONTENT = (0.003, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
 LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the scene
 STEPS = 20  # places between two kernels among which the best is sought
 COLORS = tuple(0.01 * 2 ** (i / 2) for i in range(11))  # 0.01 to 0.32, widths of the bilateral filter in colour
@@ -74,7 +74,7 @@ class RuledClosedForm(ClosedForm):
 
     :math:`s^2 = \overline{(\sigma g'(y))^2}` is the mean variance of the encoded noise, g the encoding. S is the power
     spectrum of photographs, and r this scene's share of it: the power of differences between neighbouring pixels of
-    the encoded capture, less that of noise, over the one that photographs would have behind this camera; between .03
+    the encoded capture, less that of noise, over the one that photographs would have behind this camera; between .003
     and 4 times :math:`\overline{g'^2}`. Noise counts by .3, as the bilateral filter takes noise away. Kernels are of
     bounded size, so a PSF that fills its window is inverted less sharply, and rather by Tikhonov's.
 

@@ -23,7 +23,6 @@ from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import SHIPPED, camera, in_words, own_system, pool_names
-from tests.benchmarks.any_camera.training import start
 from tests.benchmarks.results.scenes import BenchScene, real_scenes
 
 SIDE = 256  # px, the middle of a scene
@@ -134,7 +133,7 @@ def networks_of(folder: Path, candidates: bool) -> dict[str, torch.nn.Module]:
 def first_weights(folder: Path) -> dict[str, Tensor]:
     """Return the weights from which training in a folder begins: its ``first.pt``, or those of a shipped network."""
     stored = folder / "first.pt"
-    return torch.load(stored, weights_only=True) if stored.exists() else start().network.state_dict()
+    return torch.load(stored, weights_only=True) if stored.exists() else any_camera_head().network.state_dict()
 
 
 def averaged(folder: Path) -> dict[str, Tensor]:

@@ -22,12 +22,11 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead, corrected, from_one_camera, largest_share
+from kornia_tidy.reconstruction.any_camera import any_camera_head, corrected, largest_share
 from kornia_tidy.reconstruction.capture_checks import JPEG_NOISE
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.seeds import keyed_seed
@@ -46,8 +45,7 @@ NOISE_ERROR = 1.5  # largest factor by which the noise told is wrong
 BITS = (8, 10, 12, 14, 16)
 RATE, WARM_UP = 3e-4, 100
 DECAY = 0.998
-TAUGHT_SHARE = 0.3
-START = "edof-5"
+TAUGHT_SHARE = 0.35
 SAVED_EVERY = 100  # steps
 
 
@@ -213,14 +211,6 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
     return tuple(part.flip(3) if mirrored else part for part in turned)  # ty: ignore[invalid-return-type]
 
 
-def start() -> AnyCameraHead:
-    """Return the network before the first step, with the weights of a shipped one."""
-    head = AnyCameraHead()
-    trained: Any = load_pretrained(START).head
-    head.network.load_state_dict(from_one_camera(trained.network.state_dict(), head))
-    return head
-
-
 def losses(estimate: Tensor, truth: Tensor, known: Tensor) -> Tensor:
     """Return the loss of each picture, (B,)."""
     parts = zip(*(part.split(1) for part in (estimate, truth, known)), strict=True)
@@ -230,7 +220,7 @@ def losses(estimate: Tensor, truth: Tensor, known: Tensor) -> Tensor:
 def train(folder: Path, steps: int, minutes: float = math.inf) -> None:
     """Train; goes on from the checkpoint in the folder, and ends after so many steps or minutes."""
     cameras, path = Cameras(folder / "captures", "training"), folder / "checkpoint.pt"
-    network = start().network.train().to(memory_format=torch.channels_last)
+    network = any_camera_head().network.train().to(memory_format=torch.channels_last)
     if (first := folder / "first.pt").exists():
         network.load_state_dict(torch.load(first, weights_only=True))
     anchor = [part.detach().clone() for part in network.parameters()]
