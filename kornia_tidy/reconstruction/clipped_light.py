@@ -26,7 +26,7 @@ def beyond_full_scale(light: Tensor, noise: Tensor | float) -> Tensor:
         noise: standard deviation in linear light, a number or (B, 1, 1, 1).
 
     Returns:
-        Light of the same shape, at most 1.5 where it was clipped.
+        Light of the same shape, at most 1.5 where it was clipped. Light above full scale is known, and stays.
 
     Source: Knutsson and Westin, Normalized and differential convolution (CVPR 1993), for the mean of known pixels.
 
@@ -36,7 +36,7 @@ def beyond_full_scale(light: Tensor, noise: Tensor | float) -> Tensor:
         >>> bool((found[..., :40] == seen[..., :40]).all()), bool((found[..., 48:] > 1.1).all())
         (True, True)
     """
-    clipped = light >= CLIPPED
+    clipped = (light - 1).abs() <= 1 - CLIPPED
     if not clipped.any():
         return light
     known = (~clipped).to(light)

@@ -28,13 +28,20 @@ def blurred(light: torch.Tensor, sigma: float = 2.0) -> torch.Tensor:
 def test_only_clipped_pixels_change() -> None:
     seen = blurred(blob(2.5)).clamp(max=1)
     found = beyond_full_scale(seen, NOISE)
-    assert torch.equal(found[seen < 0.999], seen[seen < 0.999])
+    assert torch.equal(found[seen < 0.998], seen[seen < 0.998])
     assert float(found.max()) <= 1 + MOST
 
 
 def test_a_capture_without_clipped_pixels_is_returned_as_it_is() -> None:
     seen = blurred(blob(0.9))
     assert beyond_full_scale(seen, NOISE) is seen
+
+
+def test_light_that_is_not_clipped_stays() -> None:
+    seen = blurred(blob(2.5))
+    found = beyond_full_scale(seen, NOISE)
+    assert float((found - seen).abs().max()) < 0.1
+    assert float(((found - seen) != 0).float().mean()) < 1e-3
 
 
 def test_white_that_noise_lifts_to_full_scale_stays_near_it() -> None:
