@@ -2,10 +2,10 @@
 // for several exposures, and the gradients of the states' waves and weights. The formulas are in scattered_ops.py.
 //
 // For each depth the points of a patch, which share a wave, are spread on a patch of the grid. This is added to the grid
-// of each state, times the state's wave. Rows of a grid are transformed by real matrices as sums and differences of
-// mirrored rows, then columns. Sums over pixels act once on the average over states.
+// of each state, times the state's wave. Sums and differences of a grid's mirrored rows and columns are transformed by real
+// matrices, rows first. Sums over pixels act once on the average over states.
 //
-// Complex numbers of grids are interleaved. A depth is computed by one thread, and gradients are added depth by depth, so
+// A row of a grid holds the points of an x, so that y lies in the lanes of vectors. Complex numbers of grids are interleaved. A depth is computed by one thread, and gradients are added depth by depth, so
 // that results are the same for any number of threads.
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
@@ -41,6 +41,25 @@ INLINE vec signs(void) {
     for (int i = 0; i < LANES; i++) x[i] = i % 2 ? 1 : -1;
     return x;
 }
+
+// For PICK: complex numbers in reverse order, and those of two vectors by turns, of their first and of their second halves.
+#if VECTOR_BYTES == 64 && IS(REAL)
+#define REVERSE 14, 15, 12, 13, 10, 11, 8, 9, 6, 7, 4, 5, 2, 3, 0, 1
+#define FIRST_HALVES 0, 1, 16, 17, 2, 3, 18, 19, 4, 5, 20, 21, 6, 7, 22, 23
+#define SECOND_HALVES 8, 9, 24, 25, 10, 11, 26, 27, 12, 13, 28, 29, 14, 15, 30, 31
+#elif VECTOR_BYTES == 64 || (VECTOR_BYTES == 32 && IS(REAL))
+#define REVERSE 6, 7, 4, 5, 2, 3, 0, 1
+#define FIRST_HALVES 0, 1, 8, 9, 2, 3, 10, 11
+#define SECOND_HALVES 4, 5, 12, 13, 6, 7, 14, 15
+#elif VECTOR_BYTES == 32 || IS(REAL)
+#define REVERSE 2, 3, 0, 1
+#define FIRST_HALVES 0, 1, 4, 5
+#define SECOND_HALVES 2, 3, 6, 7
+#else
+#define REVERSE 0, 1
+#define FIRST_HALVES 0, 1
+#define SECOND_HALVES 2, 3
+#endif
 
 // Interleaved complex numbers times i.
 INLINE vec times_i(vec x) { return PICK(x, x, SWAP) * signs(); }
@@ -91,18 +110,34 @@ INLINE void add_products(const REAL *numbers, const vec *x, int64_t inner, int64
         for (int v = 0; v < count; v++) out[n * vecs + v] = sums[n][v];
 }
 
+// out (BLOCK, vecs) = a block of a matrix x (inner, vecs).
+INLINE void multiply_block(const REAL *numbers, const vec *x, int64_t inner, int64_t vecs, vec *out) {
+    int64_t v = 0;
+    for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, x + v, inner, vecs, SPAN, out + v);
+    if (vecs - v == 5) add_products(numbers, x + v, inner, vecs, 5, out + v);
+    else if (vecs - v == 4) add_products(numbers, x + v, inner, vecs, 4, out + v);
+    else if (vecs - v == 3) add_products(numbers, x + v, inner, vecs, 3, out + v);
+    else if (vecs - v == 2) add_products(numbers, x + v, inner, vecs, 2, out + v);
+    else if (vecs - v == 1) add_products(numbers, x + v, inner, vecs, 1, out + v);
+}
+
 // out (padded rows, vecs) = matrix (rows, inner) x (inner, vecs).
 static void multiply(const matrix *m, const vec *x, int64_t vecs, vec *out) {
     for (int64_t b = 0; b < m->blocks; b++, out += BLOCK * vecs) {
-        const REAL *numbers = m->numbers + (b * m->inner + m->first[b]) * BLOCK;
-        const vec *from = x + m->first[b] * vecs;
-        const int64_t inner = m->after[b] - m->first[b];
-        int64_t v = 0;
-        for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, from + v, inner, vecs, SPAN, out + v);
-        if (SPAN > 3 && vecs - v >= 3) add_products(numbers, from + v, inner, vecs, 3, out + v), v += 3;
-        if (vecs - v == 2) add_products(numbers, from + v, inner, vecs, 2, out + v);
-        else if (vecs - v == 1) add_products(numbers, from + v, inner, vecs, 1, out + v);
+        const int64_t first = m->first[b];
+        multiply_block(m->numbers + (b * m->inner + first) * BLOCK, x + first * vecs, m->after[b] - first, vecs, out);
     }
+}
+
+// A table (inner, columns) for products with blocks, its rows padded with zeros to whole vectors; of a matrix or of its
+// transpose. Returns the rest of the memory.
+static vec *spread_out(const REAL *from, int64_t inner, int64_t columns, int transposed, vec *memory) {
+    const int64_t pitch = (columns + LANES - 1) / LANES * LANES;
+    REAL *to = (REAL *)memory;
+    memset(to, 0, inner * pitch * sizeof(REAL));
+    for (int64_t i = 0; i < inner; i++)
+        for (int64_t n = 0; n < columns; n++) to[i * pitch + n] = transposed ? from[n * inner + i] : from[i * columns + n];
+    return memory + inner * pitch / LANES;
 }
 
 // ---------------------------------------------------------------------- points of a place
@@ -111,11 +146,14 @@ static void multiply(const matrix *m, const vec *x, int64_t vecs, vec *out) {
 typedef struct {
     const scattered *s;
     int64_t tall, rows, vecs;         // samples that a patch touches along an axis; padded; vectors of a row of them
-    int64_t across, along, beside;    // vectors in a row of the grid, in one of samples, in one of pixels
+    int64_t across, along, beside;    // vectors in a row of the grid, in half a row of samples, in one of pixels
+    int64_t folded;                   // vectors in a row of sums and one of differences of a grid's columns
+    int64_t upright;                  // vectors in half a column of the grid
     int64_t *start;                   // (patches, 2): first row and column that a patch touches
     REAL *row_weights;                // (patches, points, rows)
     vec *column_weights;              // (patches, points, vecs), each number twice
-    matrix cosines, sines, cosines_back, sines_back;
+    matrix cosines, sines, cosines_back, sines_back;                          // of rows
+    vec *cosine_table, *sine_table, *cosine_table_back, *sine_table_back;     // of columns: (extent / 2, along), back
     matrix *pixels;                   // (exposures, shifts, 4): columns, rows, and the transposes
     int64_t size;                     // vectors of a desk
     vec *desks;                       // (threads, size)
@@ -128,7 +166,7 @@ static int find_patches(work *w, const double *places) {
     w->tall = 0;
     for (int axis = 0; axis < 2; axis++)
         for (int64_t c = 0; c < s->patches; c++) {
-            const double *place = places + (axis * s->patches + c) * s->points;
+            const double *place = places + ((1 - axis) * s->patches + c) * s->points;
             double low = place[0], high = place[0];
             for (int64_t i = 1; i < s->points; i++) {
                 low = place[i] < low || place[i] != place[i] ? place[i] : low;
@@ -159,8 +197,8 @@ static void fill_weights(work *w, const double *places) {
 #pragma omp parallel for num_threads(s->threads)
     for (int64_t c = 0; c < s->patches; c++)
         for (int64_t i = c * s->points; i < (c + 1) * s->points; i++) {
-            const REAL row = (REAL)(places[i] - (double)w->start[2 * c]);
-            const REAL column = (REAL)(places[s->patches * s->points + i] - (double)w->start[2 * c + 1]);
+            const REAL row = (REAL)(places[s->patches * s->points + i] - (double)w->start[2 * c]);
+            const REAL column = (REAL)(places[i] - (double)w->start[2 * c + 1]);
             for (int64_t t = 0; t < w->rows; t += LANES) {
                 const vec x = spread_kernel(s, steps() + ((REAL)t - row));
                 memcpy(w->row_weights + i * w->rows + t, &x, least(LANES, w->rows - t) * sizeof(REAL));
@@ -254,14 +292,17 @@ typedef struct {
     REAL *field;         // (patches, points) complex
     vec *grids;          // (exposures, states, extent, across)
     vec *patch, *turned; // (rows, vecs)
-    vec *sum, *less;     // (extent / 2, across or along): of mirrored rows, and their difference times -i
-    vec *even, *odd;     // (samples / 2, across or along): their transforms
-    vec *half;           // (extent, along): columns of the grid, transformed
-    vec *light;          // (samples, along): average over states of squared real and imaginary parts
-    vec *lines;          // (window, along): light summed to columns of pixels
+    vec *sum, *less;     // (extent / 2, folded): of mirrored rows, and their difference times -i; columns alike
+    vec *even, *odd;     // (samples / 2, folded): their transforms
+    REAL *blocks[2];     // (samples / 2, extent / 2, BLOCK): sum and difference of columns for mirrored rows of samples
+    vec *parts[2];       // (samples / 2, BLOCK, along): their transforms
+    vec *light;          // (samples, 2, along): average over states of squared moduli, of either half of y
+    vec *lines;          // (window, 2, along): light summed to columns of pixels
     vec *turned_lines;   // (samples, beside): the same the other way round
     vec *pixels;         // (window, beside)
-    vec *of_light;       // (samples, along): gradient
+    vec *of_light;       // (samples, 2, along): gradient
+    REAL *turned_parts;  // (samples / 2, BLOCK): a block of gradients of parts the other way round
+    vec *block;          // (BLOCK, upright): of columns of the grid
 } desk;
 
 INLINE vec *grid_row(const work *w, vec *grid, int64_t row) { return grid + row * w->across; }
@@ -288,80 +329,119 @@ static void fill_grids(const work *w, const desk *d) {
     }
 }
 
-// Transforms the rows of a grid, (extent, vecs), to the even and odd parts of samples, (samples / 2, vecs).
-static void transform(const work *w, const vec *grid, int64_t vecs, const desk *d) {
-    const int64_t half = w->s->extent / 2;
+// Sums and differences of a grid's mirrored rows and columns. A row of them holds sums of columns, and then differences.
+static void fold(const work *w, const REAL *grid, const desk *d) {
+    const int64_t half = w->s->extent / 2, pitch = w->across * LANES;
     for (int64_t i = 0; i < half; i++) {
-        const vec *above = grid + (half + i) * vecs, *below = grid + (half - 1 - i) * vecs;
-        for (int64_t v = 0; v < vecs; v++) {
-            d->sum[i * vecs + v] = above[v] + below[v];
-            d->less[i * vecs + v] = times_i(below[v] - above[v]);
+        const REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - 1 - i) * pitch + 2 * half;
+        for (int odd = 0; odd < 2; odd++) {
+            REAL *sum = (REAL *)(d->sum + i * w->folded) + odd * 2 * half, *less = (REAL *)(d->less + i * w->folded) + odd * 2 * half;
+            for (int64_t m = 0; m < 2 * half; m += LANES) {
+                const vec a = *(const loose *)(above + m), b = *(const loose *)(below + m);
+                vec e = *(const loose *)(above - m - LANES), f = *(const loose *)(below - m - LANES);
+                e = PICK(e, e, REVERSE), f = PICK(f, f, REVERSE);
+                const vec up = odd ? times_i(e - a) : a + e, down = odd ? times_i(f - b) : b + f;
+                *(loose *)(sum + m) = up + down;
+                *(loose *)(less + m) = times_i(down - up);
+            }
         }
     }
-    multiply(&w->cosines, d->sum, vecs, d->even);
-    multiply(&w->sines, d->less, vecs, d->odd);
 }
 
-// The transpose of it, from gradients of the even and odd parts to that of the grid.
-static void transform_back(const work *w, vec *grid, int64_t vecs, const desk *d) {
-    const int64_t half = w->s->extent / 2;
-    multiply(&w->cosines_back, d->even, vecs, d->sum);
-    multiply(&w->sines_back, d->odd, vecs, d->less);
-    for (int64_t i = 0; i < half; i++)
-        for (int64_t v = 0; v < vecs; v++) {
-            const vec one = d->sum[i * vecs + v], two = times_i(d->less[i * vecs + v]);
-            grid[(half + i) * vecs + v] = one + two;
-            grid[(half - 1 - i) * vecs + v] = one - two;
+// The transpose of it.
+static void unfold(const work *w, REAL *grid, const desk *d) {
+    const int64_t half = w->s->extent / 2, pitch = w->across * LANES;
+    for (int64_t i = 0; i < half; i++) {
+        REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - 1 - i) * pitch + 2 * half;
+        const REAL *sum = (const REAL *)(d->sum + i * w->folded), *less = (const REAL *)(d->less + i * w->folded);
+        for (int64_t m = 0; m < 2 * half; m += LANES) {
+            const size_t size = least(LANES, 2 * half - m) * sizeof(REAL);
+            const vec even = *(const loose *)(sum + m), odd = *(const loose *)(sum + 2 * half + m);
+            const vec one = times_i(*(const loose *)(less + m)), two = times_i(*(const loose *)(less + 2 * half + m));
+            for (int side = 0; side < 2; side++) {
+                REAL *row = side ? below : above;
+                const vec p = side ? even - one : even + one, q = times_i(side ? odd - two : odd + two), high = p + q;
+                vec low = p - q;
+                low = PICK(low, low, REVERSE);
+                memcpy(row + m, &high, size);
+                memcpy(row - m - size / sizeof(REAL), (const char *)&low + sizeof low - size, size);
+            }
         }
+    }
 }
 
-// Transforms the grid of a state to the even and odd parts of its samples.
+// Transforms the grid of a state to the parts of its samples.
 static void transform_state(const work *w, int64_t k, const desk *d) {
     const int64_t half = w->s->samples / 2, extent = w->s->extent;
-    transform(w, grid_row(w, d->grids, k * extent), w->across, d);
-    for (int64_t n = 0; n < extent; n++) {
-        REAL *low = (REAL *)(d->half + n * w->along) + 2 * (half - 1), *high = low + 2;
-        const REAL *even = (const REAL *)d->even + 2 * n, *odd = (const REAL *)d->odd + 2 * n;
-        for (int64_t j = 0; j < half; j++, low -= 2, high += 2, even += w->across * LANES, odd += w->across * LANES) {
-            high[0] = even[0] + odd[0], high[1] = even[1] + odd[1];
-            low[0] = even[0] - odd[0], low[1] = even[1] - odd[1];
+    fold(w, (const REAL *)grid_row(w, d->grids, k * extent), d);
+    multiply(&w->cosines, d->sum, w->folded, d->even);
+    multiply(&w->sines, d->less, w->folded, d->odd);
+    for (int odd = 0; odd < 2; odd++)
+        for (int64_t j = 0; j < half; j++) {
+            const REAL *even_row = (const REAL *)(d->even + j * w->folded) + odd * extent,
+                       *odd_row = (const REAL *)(d->odd + j * w->folded) + odd * extent;
+            REAL *block = d->blocks[odd] + j * extent / 2 * BLOCK;
+            for (int64_t m = 0; m < extent; m += LANES) {
+                const vec a = *(const loose *)(even_row + m), b = *(const loose *)(odd_row + m), high = a + b, low = a - b;
+                *(loose *)(block + 2 * m) = PICK(high, low, FIRST_HALVES);
+                *(loose *)(block + 2 * m + LANES) = PICK(high, low, SECOND_HALVES);
+            }
         }
-    }
-    transform(w, d->half, w->along, d);
+    for (int odd = 0; odd < 2; odd++)
+        for (int64_t j = 0; j < half; j++)
+            multiply_block(d->blocks[odd] + j * extent / 2 * BLOCK, odd ? w->sine_table : w->cosine_table, extent / 2, w->along,
+                           d->parts[odd] + j * BLOCK * w->along);
 }
 
 static void transform_state_back(const work *w, int64_t k, const desk *d) {
     const int64_t half = w->s->samples / 2, extent = w->s->extent;
-    transform_back(w, d->half, w->along, d);
-    for (int64_t n = 0; n < extent; n++) {
-        const REAL *low = (REAL *)(d->half + n * w->along) + 2 * (half - 1), *high = low + 2;
-        REAL *even = (REAL *)d->even + 2 * n, *odd = (REAL *)d->odd + 2 * n;
-        for (int64_t j = 0; j < half; j++, low -= 2, high += 2, even += w->across * LANES, odd += w->across * LANES) {
-            even[0] = high[0] + low[0], even[1] = high[1] + low[1];
-            odd[0] = high[0] - low[0], odd[1] = high[1] - low[1];
+    for (int odd = 0; odd < 2; odd++)
+        for (int64_t j = 0; j < half; j++) {
+            const REAL *part = (const REAL *)(d->parts[odd] + j * BLOCK * w->along);
+            for (int64_t q = 0; q < half; q++)
+                for (int n = 0; n < BLOCK; n++) d->turned_parts[q * BLOCK + n] = part[n * w->along * LANES + q];
+            multiply_block(d->turned_parts, odd ? w->sine_table_back : w->cosine_table_back, half, w->upright, d->block);
+            REAL *even_row = (REAL *)(d->even + j * w->folded) + odd * extent, *odd_row = (REAL *)(d->odd + j * w->folded) + odd * extent;
+            const REAL *high = (const REAL *)d->block, *low = high + 2 * w->upright * LANES;
+            for (int64_t m = 0; m < extent / 2; m++)
+                for (int n = 0; n < 2; n++) {
+                    const REAL a = high[n * w->upright * LANES + m], b = low[n * w->upright * LANES + m];
+                    even_row[2 * m + n] = a + b, odd_row[2 * m + n] = a - b;
+                }
         }
-    }
-    transform_back(w, grid_row(w, d->grids, k * extent), w->across, d);
+    multiply(&w->cosines_back, d->even, w->folded, d->sum);
+    multiply(&w->sines_back, d->odd, w->folded, d->less);
+    unfold(w, (REAL *)grid_row(w, d->grids, k * extent), d);
 }
 
 static void add_light(const work *w, REAL weight, const desk *d) {
     const int64_t half = w->s->samples / 2, vecs = w->along;
     for (int64_t j = 0; j < half; j++)
-        for (int64_t v = 0; v < vecs; v++) {
-            const vec a = d->even[j * vecs + v], b = d->odd[j * vecs + v], high = a + b, low = a - b;
-            d->light[(half + j) * vecs + v] += weight * high * high;
-            d->light[(half - 1 - j) * vecs + v] += weight * low * low;
+        for (int side = 0; side < 2; side++) {
+            vec *row = d->light + (side ? half - 1 - j : half + j) * 2 * vecs;
+            const vec *even = d->parts[0] + (j * BLOCK + 2 * side) * vecs, *odd = d->parts[1] + (j * BLOCK + 2 * side) * vecs;
+            for (int64_t v = 0; v < vecs; v++) {
+                const vec a = even[v], b = odd[v], c = even[vecs + v], e = odd[vecs + v];
+                row[v] += weight * ((a + b) * (a + b) + (c + e) * (c + e));
+                row[vecs + v] += weight * ((a - b) * (a - b) + (c - e) * (c - e));
+            }
         }
+}
+
+// Where a sample of y stands in a row of light.
+INLINE int64_t at_y(const work *w, int64_t y) {
+    const int64_t half = w->s->samples / 2;
+    return y < half ? w->along * LANES + half - 1 - y : y - half;
 }
 
 static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL *out) {
     const int64_t window = w->s->window;
     for (int64_t v = 0; v < w->s->shifts; v++, out += window * window) {
-        multiply(pixels + 4 * v, d->light, w->along, d->lines);
-        for (int64_t p = 0; p < window; p++) {
-            const REAL *line = (const REAL *)(d->lines + p * w->along);
-            for (int64_t y = 0; y < w->s->samples; y++)
-                ((REAL *)(d->turned_lines + y * w->beside))[p] = line[2 * y] + line[2 * y + 1];
+        multiply(pixels + 4 * v, d->light, 2 * w->along, d->lines);
+        for (int64_t y = 0; y < w->s->samples; y++) {
+            const REAL *line = (const REAL *)d->lines + at_y(w, y);
+            REAL *turned = (REAL *)(d->turned_lines + y * w->beside);
+            for (int64_t p = 0; p < window; p++) turned[p] = line[p * 2 * w->along * LANES];
         }
         multiply(pixels + 4 * v + 1, d->turned_lines, w->beside, d->pixels);
         for (int64_t q = 0; q < window; q++) memcpy(out + q * window, d->pixels + q * w->beside, window * sizeof(REAL));
@@ -370,31 +450,35 @@ static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL 
 
 // The transpose of it, to the gradient of the light.
 static void spread_pixels(const work *w, const matrix *pixels, const desk *d, const REAL *gradient) {
-    const int64_t window = w->s->window, size = w->s->samples * w->along;
+    const int64_t window = w->s->window, size = w->s->samples * 2 * w->along;
     memset(d->of_light, 0, size * sizeof(vec));
     for (int64_t v = 0; v < w->s->shifts; v++) {
         for (int64_t q = 0; q < window; q++, gradient += window) memcpy(d->pixels + q * w->beside, gradient, window * sizeof(REAL));
         multiply(pixels + 4 * v + 3, d->pixels, w->beside, d->turned_lines);
-        for (int64_t p = 0; p < window; p++) {
-            REAL *line = (REAL *)(d->lines + p * w->along);
-            for (int64_t y = 0; y < w->s->samples; y++)
-                line[2 * y] = line[2 * y + 1] = ((const REAL *)(d->turned_lines + y * w->beside))[p];
+        for (int64_t y = 0; y < w->s->samples; y++) {
+            REAL *line = (REAL *)d->lines + at_y(w, y);
+            const REAL *turned = (const REAL *)(d->turned_lines + y * w->beside);
+            for (int64_t p = 0; p < window; p++) line[p * 2 * w->along * LANES] = turned[p];
         }
-        multiply(pixels + 4 * v + 2, d->lines, w->along, d->light);
+        multiply(pixels + 4 * v + 2, d->lines, 2 * w->along, d->light);
         for (int64_t n = 0; n < size; n++) d->of_light[n] += d->light[n];
     }
 }
 
-// Turns even and odd parts into their gradients, and returns that of the state's weight.
+// Turns the parts of a state's samples into their gradients, and returns that of the state's weight.
 static REAL light_gradient(const work *w, REAL weight, const desk *d) {
     const int64_t half = w->s->samples / 2, vecs = w->along;
     vec total = {0};
     for (int64_t j = 0; j < half; j++)
-        for (int64_t v = 0; v < vecs; v++) {
-            vec *a = d->even + j * vecs + v, *b = d->odd + j * vecs + v, high = *a + *b, low = *a - *b;
-            const vec up = d->of_light[(half + j) * vecs + v] * high, down = d->of_light[(half - 1 - j) * vecs + v] * low;
-            total += up * high + down * low;
-            *a = 2 * weight * (up + down), *b = 2 * weight * (up - down);
+        for (int side = 0; side < 2; side++) {
+            const vec *row = d->of_light + (side ? half - 1 - j : half + j) * 2 * vecs;
+            for (int64_t v = 0; v < 2 * vecs; v++) {  // real parts, then imaginary ones
+                const int64_t at = (j * BLOCK + 2 * side) * vecs + v, y = v < vecs ? v : v - vecs;
+                vec *a = d->parts[0] + at, *b = d->parts[1] + at;
+                const vec high = *a + *b, low = *a - *b, up = row[y] * high, down = row[vecs + y] * low;
+                total += up * high + down * low;
+                *a = 2 * weight * (up + down), *b = 2 * weight * (up - down);
+            }
         }
     return sum_of(total);
 }
@@ -421,28 +505,34 @@ static void gather_waves(const work *w, const desk *d, REAL *of_waves) {
 // Shares memory out to a thread's desk, and returns the number of vectors that it takes.
 static int64_t share_out(const work *w, vec *memory, desk *d) {
     const scattered *s = w->s;
-    const int64_t wide = w->across > w->along ? w->across : w->along, half = padded(s->extent / 2, BLOCK) * wide,
-                  samples = padded(s->samples, BLOCK), transformed = padded(s->samples / 2, BLOCK) * wide;
+    const int64_t half = s->extent / 2, samples = padded(s->samples, BLOCK), transformed = padded(s->samples / 2, BLOCK);
+    const int64_t block = s->samples / 2 * half * BLOCK / LANES + 3, part = s->samples / 2 * BLOCK * w->along;
     const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
-                             s->exposures * s->states * s->extent * w->across,
+                             s->exposures * s->states * s->extent * w->across + 1,
                              w->rows * w->vecs,
                              w->rows * w->vecs,
-                             half,
-                             half,
-                             transformed,
-                             transformed,
-                             s->extent * w->along,
-                             samples * w->along,
-                             padded(s->window, BLOCK) * w->along,
+                             padded(half, BLOCK) * w->folded + 1,
+                             padded(half, BLOCK) * w->folded + 1,
+                             transformed * w->folded + 1,
+                             transformed * w->folded + 1,
+                             block,
+                             block,
+                             part,
+                             part,
+                             samples * 2 * w->along,
+                             padded(s->window, BLOCK) * 2 * w->along,
                              samples * w->beside,
                              padded(s->window, BLOCK) * w->beside,
-                             samples * w->along};
-    int64_t at[15] = {0};
-    for (int n = 0; n < 14; n++) at[n + 1] = at[n] + sizes[n];
-    if (memory)
-        *d = (desk){(REAL *)memory,  memory + at[1], memory + at[2], memory + at[3],  memory + at[4],  memory + at[5],  memory + at[6],
-                    memory + at[7],  memory + at[8], memory + at[9], memory + at[10], memory + at[11], memory + at[12], memory + at[13]};
-    return at[14];
+                             samples * 2 * w->along,
+                             s->samples / 2 * BLOCK / LANES + 1,
+                             BLOCK * w->upright};
+    enum { PARTS = sizeof sizes / sizeof *sizes };
+    vec *at[PARTS];
+    int64_t total = 0;
+    for (int n = 0; n < PARTS; total += sizes[n++]) at[n] = memory ? memory + total : 0;
+    *d = (desk){(REAL *)at[0], at[1],  at[2],  at[3],  at[4],  at[5],  at[6],           at[7],  {(REAL *)at[8], (REAL *)at[9]},
+                {at[10], at[11]}, at[12], at[13], at[14], at[15], at[16], (REAL *)at[17], at[18]};
+    return total;
 }
 
 // One depth of a place: its light, or the gradients, which are added to `of_waves` and `of_weights`.
@@ -457,7 +547,7 @@ static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves,
     for (int64_t e = 0; e < s->exposures; e++) {
         const matrix *pixels = w->pixels + 4 * e * s->shifts;
         if (s->gradient) spread_pixels(w, pixels, d, s->gradient + out + e * size);
-        else memset(d->light, 0, s->samples * w->along * sizeof(vec));
+        else memset(d->light, 0, s->samples * 2 * w->along * sizeof(vec));
         for (int64_t k = 0; k < s->states; k++) {
             transform_state(w, e * s->states + k, d);
             if (!s->gradient) add_light(w, s->weights[k], d);
@@ -479,10 +569,12 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     w->rows = padded(w->tall, ROWS), w->vecs = (2 * w->tall + LANES - 1) / LANES;
     const int64_t most = 2 * (s->extent - w->tall) + w->vecs * LANES;
     w->across = ((most > 2 * s->extent ? most : 2 * s->extent) + LANES - 1) / LANES;
-    w->along = (2 * s->samples + LANES - 1) / LANES, w->beside = (s->window + LANES - 1) / LANES;
+    w->folded = (2 * s->extent + LANES - 1) / LANES;
+    w->beside = (s->window + LANES - 1) / LANES;
     w->row_weights = malloc(total * w->rows * sizeof(REAL));
     w->column_weights = aligned_alloc(sizeof(vec), total * w->vecs * sizeof(vec));
-    w->size = share_out(w, 0, 0);
+    desk none;
+    w->size = share_out(w, 0, &none);
     w->desks = aligned_alloc(sizeof(vec), s->threads * w->size * sizeof(vec));
     const int status = w->row_weights && w->column_weights && w->desks ? 0 : NO_MEMORY;
     if (!status) {
@@ -519,17 +611,23 @@ int scattered_light(const scattered *s) {
                   pixels = 2 * s->exposures * s->shifts * (matrix_size(s->window, s->samples) + matrix_size(s->samples, s->window));
     work own = {.s = s}, *w = &own;
     char *matrices = malloc(tables + pixels);
+    w->along = (half + LANES - 1) / LANES, w->upright = (spread + LANES - 1) / LANES;
+    w->cosine_table = aligned_alloc(sizeof(vec), 2 * (spread * w->along + half * w->upright + 1) * sizeof(vec));
     w->start = malloc(2 * s->patches * sizeof(int64_t) + 1);
     w->pixels = malloc(4 * s->exposures * s->shifts * sizeof(matrix) + 1);
     REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->exposures * s->cells + 1) * sizeof(REAL) + 1) : 0;
-    int status = matrices && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
+    int status = matrices && w->cosine_table && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
     if (!status) {
         char *rest = lay_out(&w->cosines, s->cosines, half, spread, 0, matrices);
         rest = lay_out(&w->sines, s->sines, half, spread, 0, rest);
         rest = lay_out(&w->cosines_back, s->cosines, spread, half, 1, rest);
         rest = lay_out(&w->sines_back, s->sines, spread, half, 1, rest);
+        w->sine_table = spread_out(s->cosines, spread, half, 1, w->cosine_table);
+        w->cosine_table_back = spread_out(s->sines, spread, half, 1, w->sine_table);
+        w->sine_table_back = spread_out(s->cosines, half, spread, 0, w->cosine_table_back);
+        spread_out(s->sines, half, spread, 0, w->sine_table_back);
         for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(w, place, rest, parts);
     }
-    free(matrices), free(w->start), free(w->pixels), free(parts);
+    free(matrices), free(w->cosine_table), free(w->start), free(w->pixels), free(parts);
     return status;
 }
