@@ -3,7 +3,8 @@
 //
 // For each depth the points of a patch, which share a wave, are spread on a patch of the grid. This is added to the grid
 // of each state, times the state's wave. Sums and differences of a grid's mirrored rows and columns are transformed by real
-// matrices, rows first. Sums over pixels act once on the average over states.
+// matrices, rows first; those of an even and of an odd distance from the middle apart, as samples half a period away differ
+// from them by signs. Sums over pixels act once on the average over states.
 //
 // A row of a grid holds the points of an x, so that y lies in the lanes of vectors. Complex numbers of grids are interleaved. A depth is computed by one thread, and gradients are added depth by depth, so
 // that results are the same for any number of threads.
@@ -21,14 +22,14 @@ enum { NO_MEMORY = 1, OUTSIDE = 2 };                 // status of the functions
 
 // The fields of `_Scattered` in scattered_ops.py.
 typedef struct {
-    int64_t places, depths, exposures, states, cells, patches, points, phases, amplitudes, width, degree, extent, samples,
-        shifts, window, threads;
+    int64_t places, depths, exposures, states, cells, patches, points, phases, amplitudes, width, degree, extent, quarter,
+        samples, shifts, window, threads;
     const int64_t *cell;                          // (patches,)
     const double *values;                         // (places, 2 + phases + amplitudes, patches, points)
     const double *phase_terms, *amplitude_terms;  // (depths, phases), (depths, amplitudes)
     const REAL *kernel;                           // (degree + 1,)
     const REAL *waves, *weights;                  // (exposures, states, cells) complex, (states,)
-    const REAL *cosines, *sines;                  // (samples / 2, extent / 2)
+    const REAL *cosines, *sines;                  // (quarter, extent / 2 + 1)
     const REAL *rows, *columns;                   // (places, exposures, shifts, window, samples)
     const REAL *gradient;                         // (places, depths, exposures, shifts, window, window); not for light
     REAL *light;                                  // like gradient
@@ -98,10 +99,11 @@ static char *lay_out(matrix *m, const REAL *from, int64_t rows, int64_t inner, i
     return memory + matrix_size(rows, inner);
 }
 
-INLINE void add_products(const REAL *numbers, const vec *x, int64_t inner, int64_t vecs, int count, vec *out) {
+INLINE void add_products(const REAL *numbers, int64_t step, const vec *x, int64_t pitch, int64_t inner, int64_t vecs, int count,
+                         vec *out) {
     vec sums[BLOCK][SPAN];
     memset(sums, 0, sizeof sums);
-    for (int64_t i = 0; i < inner; i++, numbers += BLOCK, x += vecs)
+    for (int64_t i = 0; i < inner; i++, numbers += step, x += pitch)
 #pragma GCC unroll 4
         for (int n = 0; n < BLOCK; n++)
 #pragma GCC unroll 6
@@ -110,34 +112,58 @@ INLINE void add_products(const REAL *numbers, const vec *x, int64_t inner, int64
         for (int v = 0; v < count; v++) out[n * vecs + v] = sums[n][v];
 }
 
-// out (BLOCK, vecs) = a block of a matrix x (inner, vecs).
-INLINE void multiply_block(const REAL *numbers, const vec *x, int64_t inner, int64_t vecs, vec *out) {
+// out (BLOCK, vecs) = a block of a matrix, with a column every few numbers, x rows of vectors.
+INLINE void multiply_block(const REAL *numbers, int64_t step, const vec *x, int64_t pitch, int64_t inner, int64_t vecs, vec *out) {
     int64_t v = 0;
-    for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, x + v, inner, vecs, SPAN, out + v);
-    if (vecs - v == 5) add_products(numbers, x + v, inner, vecs, 5, out + v);
-    else if (vecs - v == 4) add_products(numbers, x + v, inner, vecs, 4, out + v);
-    else if (vecs - v == 3) add_products(numbers, x + v, inner, vecs, 3, out + v);
-    else if (vecs - v == 2) add_products(numbers, x + v, inner, vecs, 2, out + v);
-    else if (vecs - v == 1) add_products(numbers, x + v, inner, vecs, 1, out + v);
+    for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, step, x + v, pitch, inner, vecs, SPAN, out + v);
+    if (vecs - v == 5) add_products(numbers, step, x + v, pitch, inner, vecs, 5, out + v);
+    else if (vecs - v == 4) add_products(numbers, step, x + v, pitch, inner, vecs, 4, out + v);
+    else if (vecs - v == 3) add_products(numbers, step, x + v, pitch, inner, vecs, 3, out + v);
+    else if (vecs - v == 2) add_products(numbers, step, x + v, pitch, inner, vecs, 2, out + v);
+    else if (vecs - v == 1) add_products(numbers, step, x + v, pitch, inner, vecs, 1, out + v);
 }
 
-// out (padded rows, vecs) = matrix (rows, inner) x (inner, vecs).
-static void multiply(const matrix *m, const vec *x, int64_t vecs, vec *out) {
+// out (padded rows, vecs) = matrix (rows, inner) x every few rows of (inner, vecs).
+static void multiply_rows(const matrix *m, const vec *x, int64_t pitch, int64_t vecs, vec *out) {
     for (int64_t b = 0; b < m->blocks; b++, out += BLOCK * vecs) {
         const int64_t first = m->first[b];
-        multiply_block(m->numbers + (b * m->inner + first) * BLOCK, x + first * vecs, m->after[b] - first, vecs, out);
+        multiply_block(m->numbers + (b * m->inner + first) * BLOCK, BLOCK, x + first * pitch, pitch, m->after[b] - first, vecs, out);
     }
 }
 
-// A table (inner, columns) for products with blocks, its rows padded with zeros to whole vectors; of a matrix or of its
-// transpose. Returns the rest of the memory.
-static vec *spread_out(const REAL *from, int64_t inner, int64_t columns, int transposed, vec *memory) {
-    const int64_t pitch = (columns + LANES - 1) / LANES * LANES;
-    REAL *to = (REAL *)memory;
-    memset(to, 0, inner * pitch * sizeof(REAL));
-    for (int64_t i = 0; i < inner; i++)
-        for (int64_t n = 0; n < columns; n++) to[i * pitch + n] = transposed ? from[n * inner + i] : from[i * columns + n];
-    return memory + inner * pitch / LANES;
+static void multiply(const matrix *m, const vec *x, int64_t vecs, vec *out) { multiply_rows(m, x, vecs, vecs, out); }
+
+// What takes the sums or differences of mirrored rows to their transform, and back; of columns the same as tables. Parts of
+// columns of an even and of an odd number.
+typedef struct {
+    matrix rows[2], rows_back[2];
+    vec *table[2], *table_back[2];  // (inner, across), (quarter, upright)
+} axes;
+
+// Lays the transform of cosines or sines out. The middle row and column are their own mirror images: they count twice in
+// sums, and half in what takes them forwards.
+static void lay_out_axes(const scattered *s, const REAL *from, int64_t across, int64_t upright, axes *t, char **memory, vec **tables) {
+    const int64_t inner = s->extent / 2 + 1, quarter = s->quarter;
+    for (int odd = 0; odd < 2; odd++) {
+        const int64_t count = (inner + 1 - odd) / 2;
+        REAL *part = (REAL *)*tables, *halved = part + quarter * count;
+        for (int64_t k = 0; k < quarter; k++)
+            for (int64_t i = 0; i < count; i++) {
+                part[k * count + i] = from[k * inner + 2 * i + odd];
+                halved[k * count + i] = part[k * count + i] * (REAL)(i || odd ? 1 : 0.5);
+            }
+        *memory = lay_out(t->rows + odd, halved, quarter, count, 0, *memory);
+        *memory = lay_out(t->rows_back + odd, part, count, quarter, 1, *memory);
+        REAL *table = (REAL *)(*tables += (2 * quarter * count + LANES - 1) / LANES);
+        t->table[odd] = (vec *)table, t->table_back[odd] = t->table[odd] + count * across;
+        *tables = t->table_back[odd] + quarter * upright;
+        memset(table, 0, (count * across + quarter * upright) * sizeof(vec));
+        for (int64_t k = 0; k < quarter; k++)
+            for (int64_t i = 0; i < count; i++) {
+                table[i * across * LANES + k] = halved[k * count + i];
+                ((REAL *)t->table_back[odd])[k * upright * LANES + i] = part[k * count + i];
+            }
+    }
 }
 
 // ---------------------------------------------------------------------- points of a place
@@ -146,14 +172,14 @@ static vec *spread_out(const REAL *from, int64_t inner, int64_t columns, int tra
 typedef struct {
     const scattered *s;
     int64_t tall, rows, vecs;         // samples that a patch touches along an axis; padded; vectors of a row of them
-    int64_t across, along, beside;    // vectors in a row of the grid, in half a row of samples, in one of pixels
+    int64_t across, along, beside;    // vectors in a row of the grid, in a quarter of a row of samples, in one of pixels
     int64_t folded;                   // vectors in a row of sums and one of differences of a grid's columns
-    int64_t upright;                  // vectors in half a column of the grid
+    int64_t upright;                  // vectors in a quarter of a row of the grid
+    int64_t block;                    // numbers of a block, see desk
     int64_t *start;                   // (patches, 2): first row and column that a patch touches
     REAL *row_weights;                // (patches, points, rows)
     vec *column_weights;              // (patches, points, vecs), each number twice
-    matrix cosines, sines, cosines_back, sines_back;                          // of rows
-    vec *cosine_table, *sine_table, *cosine_table_back, *sine_table_back;     // of columns: (extent / 2, along), back
+    axes cosines, sines;
     matrix *pixels;                   // (exposures, shifts, 4): columns, rows, and the transposes
     int64_t size;                     // vectors of a desk
     vec *desks;                       // (threads, size)
@@ -292,53 +318,65 @@ typedef struct {
     REAL *field;         // (patches, points) complex
     vec *grids;          // (exposures, states, extent, across)
     vec *patch, *turned; // (rows, vecs)
-    vec *sum, *less;     // (extent / 2, folded): of mirrored rows, and their difference times -i; columns alike
-    vec *even, *odd;     // (samples / 2, folded): their transforms
-    REAL *blocks[2];     // (samples / 2, extent / 2, BLOCK): sum and difference of columns for mirrored rows of samples
-    vec *parts[2];       // (samples / 2, BLOCK, along): their transforms
-    vec *light;          // (samples, 2, along): average over states of squared moduli, of either half of y
-    vec *lines;          // (window, 2, along): light summed to columns of pixels
+    vec *folded[2];      // (extent / 2 + 1, folded): sums of mirrored rows, and differences times -i; columns alike
+    vec *sets[4];        // (quarter, folded): transforms of sums of even and odd rows, and of their differences
+    REAL *blocks[2];     // (samples / 2 and more, extent / 2 + 1 and more, BLOCK): sum and difference of columns for mirrored rows of samples
+    vec *parts[4];       // (samples / 2, BLOCK, along): transforms of their even and odd columns
+    vec *light;          // (samples, 4, along): average over states of squared moduli, see at_y
+    vec *lines;          // (window, 4, along): light summed to columns of pixels
     vec *turned_lines;   // (samples, beside): the same the other way round
     vec *pixels;         // (window, beside)
-    vec *of_light;       // (samples, 2, along): gradient
-    REAL *turned_parts;  // (samples / 2, BLOCK): a block of gradients of parts the other way round
-    vec *block;          // (BLOCK, upright): of columns of the grid
+    vec *of_light;       // (samples, 4, along): gradient
+    REAL *turned_parts;  // (quarter, BLOCK): a block of gradients of parts the other way round
+    vec *rows_back;      // (extent / 4 + 1, folded): gradients of even or odd rows
+    vec *block[2];       // (BLOCK, upright): of even and odd columns of the grid
 } desk;
 
 INLINE vec *grid_row(const work *w, vec *grid, int64_t row) { return grid + row * w->across; }
 
-// Adds a patch times a wave to a grid.
-INLINE void add_patch(const vec *patch, const vec *turned, int64_t tall, int64_t vecs, REAL re, REAL im, REAL *at, int64_t pitch) {
-    for (int64_t r = 0; r < tall; r++, at += pitch, patch += vecs, turned += vecs)
-        for (int64_t v = 0; v < vecs; v++) ((loose *)at)[v] += re * patch[v] + im * turned[v];
+enum { TOGETHER = 4 };  // states whose waves stay in registers
+
+// Adds a patch times waves to the grids of some states.
+INLINE void add_patch(const work *w, const desk *d, int64_t vecs, int states, const REAL *waves, REAL *grids) {
+    const int64_t pitch = w->across * LANES, size = w->s->extent * pitch;
+    REAL re[TOGETHER], im[TOGETHER];
+#pragma GCC unroll 8
+    for (int k = 0; k < states; k++) re[k] = waves[2 * k * w->s->cells], im[k] = waves[2 * k * w->s->cells + 1];
+    for (int64_t r = 0; r < w->tall; r++, grids += pitch)
+        for (int64_t v = 0; v < vecs; v++) {
+            const vec x = d->patch[r * vecs + v], y = d->turned[r * vecs + v];
+#pragma GCC unroll 8
+            for (int k = 0; k < states; k++) ((loose *)(grids + k * size))[v] += re[k] * x + im[k] * y;
+        }
 }
 
 static void fill_grids(const work *w, const desk *d) {
     const scattered *s = w->s;
-    const int64_t tall = w->tall, vecs = w->vecs, pitch = w->across * LANES, size = s->extent * pitch;
-    memset(d->grids, 0, s->exposures * s->states * size * sizeof(REAL));
+    const int64_t vecs = w->vecs, states = s->exposures * s->states, size = s->extent * w->across * LANES;
+    memset(d->grids, 0, states * size * sizeof(REAL));
     for (int64_t c = 0; c < s->patches; c++) {
         spread(w, d->field, c, d->patch, d->turned);
-        REAL *at = (REAL *)d->grids + w->start[2 * c] * pitch + 2 * w->start[2 * c + 1];
+        REAL *at = (REAL *)d->grids + w->start[2 * c] * w->across * LANES + 2 * w->start[2 * c + 1];
         const REAL *wave = s->waves + 2 * s->cell[c];
-        for (int64_t k = 0; k < s->exposures * s->states; k++, at += size, wave += 2 * s->cells) {
-            if (vecs == 1) add_patch(d->patch, d->turned, tall, 1, wave[0], wave[1], at, pitch);
-            else if (vecs == 2) add_patch(d->patch, d->turned, tall, 2, wave[0], wave[1], at, pitch);
-            else add_patch(d->patch, d->turned, tall, vecs, wave[0], wave[1], at, pitch);
-        }
+        int64_t k = 0;
+        for (; k + TOGETHER <= states; k += TOGETHER, at += TOGETHER * size, wave += 2 * TOGETHER * s->cells)
+            if (vecs == 1) add_patch(w, d, 1, TOGETHER, wave, at);
+            else if (vecs == 2) add_patch(w, d, 2, TOGETHER, wave, at);
+            else add_patch(w, d, vecs, TOGETHER, wave, at);
+        for (; k < states; k++, at += size, wave += 2 * s->cells) add_patch(w, d, vecs, 1, wave, at);
     }
 }
 
 // Sums and differences of a grid's mirrored rows and columns. A row of them holds sums of columns, and then differences.
 static void fold(const work *w, const REAL *grid, const desk *d) {
-    const int64_t half = w->s->extent / 2, pitch = w->across * LANES;
-    for (int64_t i = 0; i < half; i++) {
-        const REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - 1 - i) * pitch + 2 * half;
+    const int64_t half = w->s->extent / 2, inner = 2 * half + 2, pitch = w->across * LANES;
+    for (int64_t i = 0; i <= half; i++) {
+        const REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - i) * pitch + 2 * half;
         for (int odd = 0; odd < 2; odd++) {
-            REAL *sum = (REAL *)(d->sum + i * w->folded) + odd * 2 * half, *less = (REAL *)(d->less + i * w->folded) + odd * 2 * half;
-            for (int64_t m = 0; m < 2 * half; m += LANES) {
+            REAL *sum = (REAL *)(d->folded[0] + i * w->folded) + odd * inner, *less = (REAL *)(d->folded[1] + i * w->folded) + odd * inner;
+            for (int64_t m = 0; m < inner; m += LANES) {
                 const vec a = *(const loose *)(above + m), b = *(const loose *)(below + m);
-                vec e = *(const loose *)(above - m - LANES), f = *(const loose *)(below - m - LANES);
+                vec e = *(const loose *)(above - m - LANES + 2), f = *(const loose *)(below - m - LANES + 2);
                 e = PICK(e, e, REVERSE), f = PICK(f, f, REVERSE);
                 const vec up = odd ? times_i(e - a) : a + e, down = odd ? times_i(f - b) : b + f;
                 *(loose *)(sum + m) = up + down;
@@ -348,100 +386,120 @@ static void fold(const work *w, const REAL *grid, const desk *d) {
     }
 }
 
-// The transpose of it.
+// The transpose of it. The middle row and column have no differences.
 static void unfold(const work *w, REAL *grid, const desk *d) {
-    const int64_t half = w->s->extent / 2, pitch = w->across * LANES;
-    for (int64_t i = 0; i < half; i++) {
-        REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - 1 - i) * pitch + 2 * half;
-        const REAL *sum = (const REAL *)(d->sum + i * w->folded), *less = (const REAL *)(d->less + i * w->folded);
-        for (int64_t m = 0; m < 2 * half; m += LANES) {
-            const size_t size = least(LANES, 2 * half - m) * sizeof(REAL);
-            const vec even = *(const loose *)(sum + m), odd = *(const loose *)(sum + 2 * half + m);
-            const vec one = times_i(*(const loose *)(less + m)), two = times_i(*(const loose *)(less + 2 * half + m));
-            for (int side = 0; side < 2; side++) {
-                REAL *row = side ? below : above;
-                const vec p = side ? even - one : even + one, q = times_i(side ? odd - two : odd + two), high = p + q;
-                vec low = p - q;
-                low = PICK(low, low, REVERSE);
-                memcpy(row + m, &high, size);
-                memcpy(row - m - size / sizeof(REAL), (const char *)&low + sizeof low - size, size);
+    const int64_t half = w->s->extent / 2, inner = 2 * half + 2, pitch = w->across * LANES;
+    for (int64_t i = 0; i <= half; i++) {
+        REAL *above = grid + (half + i) * pitch + 2 * half, *below = grid + (half - i) * pitch + 2 * half;
+        const REAL *sum = (const REAL *)(d->folded[0] + i * w->folded), *less = (const REAL *)(d->folded[1] + i * w->folded);
+        for (int64_t m = 0; m < inner; m += 2)
+            for (int n = 0; n < 2; n++) {  // times i: minus the imaginary part, and the real one
+                const int sign = n ? 1 : -1, row = i > 0, column = m > 0;
+                const REAL one = row * sign * less[m + 1 - n], two = column * sign * sum[inner + m + 1 - n],
+                           both = row * column * -less[inner + m + n];
+                above[m + n] = sum[m + n] + one + two + both, above[n - m] = sum[m + n] + one - two - both;
+                below[m + n] = sum[m + n] - one + two - both, below[n - m] = sum[m + n] - one - two + both;
             }
-        }
     }
 }
 
 // Transforms the grid of a state to the parts of its samples.
 static void transform_state(const work *w, int64_t k, const desk *d) {
-    const int64_t half = w->s->samples / 2, extent = w->s->extent;
-    fold(w, (const REAL *)grid_row(w, d->grids, k * extent), d);
-    multiply(&w->cosines, d->sum, w->folded, d->even);
-    multiply(&w->sines, d->less, w->folded, d->odd);
+    const int64_t quarter = w->s->quarter, half = w->s->samples / 2, inner = w->s->extent / 2 + 1, vecs = w->folded;
+    fold(w, (const REAL *)grid_row(w, d->grids, k * w->s->extent), d);
+    for (int n = 0; n < 4; n++)
+        multiply_rows((n < 2 ? &w->cosines : &w->sines)->rows + n % 2, d->folded[n / 2] + n % 2 * vecs, 2 * vecs, vecs, d->sets[n]);
     for (int odd = 0; odd < 2; odd++)
-        for (int64_t j = 0; j < half; j++) {
-            const REAL *even_row = (const REAL *)(d->even + j * w->folded) + odd * extent,
-                       *odd_row = (const REAL *)(d->odd + j * w->folded) + odd * extent;
-            REAL *block = d->blocks[odd] + j * extent / 2 * BLOCK;
-            for (int64_t m = 0; m < extent; m += LANES) {
-                const vec a = *(const loose *)(even_row + m), b = *(const loose *)(odd_row + m), high = a + b, low = a - b;
-                *(loose *)(block + 2 * m) = PICK(high, low, FIRST_HALVES);
-                *(loose *)(block + 2 * m + LANES) = PICK(high, low, SECOND_HALVES);
+        for (int64_t j = 0; j < quarter; j++) {
+            const REAL *set[4];
+            for (int n = 0; n < 4; n++) set[n] = (const REAL *)(d->sets[n] + j * vecs) + odd * 2 * inner;
+            REAL *near = d->blocks[odd] + j * w->block, *far = d->blocks[odd] + (2 * quarter - 1 - j) * w->block;
+            for (int64_t m = 0; m < 2 * inner; m += LANES) {
+                const vec a = *(const loose *)(set[0] + m), b = *(const loose *)(set[1] + m), c = *(const loose *)(set[2] + m),
+                          e = *(const loose *)(set[3] + m);
+                const vec high = (a + b) + (c + e), low = (a + b) - (c + e), there = (a - b) + (e - c), back = (a - b) - (e - c);
+                *(loose *)(near + 2 * m) = PICK(high, low, FIRST_HALVES);
+                *(loose *)(near + 2 * m + LANES) = PICK(high, low, SECOND_HALVES);
+                *(loose *)(far + 2 * m) = PICK(there, back, FIRST_HALVES);
+                *(loose *)(far + 2 * m + LANES) = PICK(there, back, SECOND_HALVES);
             }
         }
-    for (int odd = 0; odd < 2; odd++)
+    for (int n = 0; n < 4; n++) {
+        const vec *table = (n < 2 ? &w->cosines : &w->sines)->table[n % 2];
         for (int64_t j = 0; j < half; j++)
-            multiply_block(d->blocks[odd] + j * extent / 2 * BLOCK, odd ? w->sine_table : w->cosine_table, extent / 2, w->along,
-                           d->parts[odd] + j * BLOCK * w->along);
+            multiply_block(d->blocks[n / 2] + j * w->block + n % 2 * BLOCK, 2 * BLOCK, table, w->along, (inner + 1 - n % 2) / 2, w->along,
+                           d->parts[n] + j * BLOCK * w->along);
+    }
 }
 
 static void transform_state_back(const work *w, int64_t k, const desk *d) {
-    const int64_t half = w->s->samples / 2, extent = w->s->extent;
+    const int64_t quarter = w->s->quarter, half = w->s->samples / 2, inner = w->s->extent / 2 + 1, pitch = w->upright * LANES;
+    for (int n = 0; n < 4; n++) memset(d->sets[n], 0, quarter * w->folded * sizeof(vec));
     for (int odd = 0; odd < 2; odd++)
         for (int64_t j = 0; j < half; j++) {
-            const REAL *part = (const REAL *)(d->parts[odd] + j * BLOCK * w->along);
-            for (int64_t q = 0; q < half; q++)
-                for (int n = 0; n < BLOCK; n++) d->turned_parts[q * BLOCK + n] = part[n * w->along * LANES + q];
-            multiply_block(d->turned_parts, odd ? w->sine_table_back : w->cosine_table_back, half, w->upright, d->block);
-            REAL *even_row = (REAL *)(d->even + j * w->folded) + odd * extent, *odd_row = (REAL *)(d->odd + j * w->folded) + odd * extent;
-            const REAL *high = (const REAL *)d->block, *low = high + 2 * w->upright * LANES;
-            for (int64_t m = 0; m < extent / 2; m++)
+            for (int n = 0; n < 2; n++) {
+                const REAL *part = (const REAL *)(d->parts[2 * odd + n] + j * BLOCK * w->along);
+                for (int64_t q = 0; q < quarter; q++)
+                    for (int r = 0; r < BLOCK; r++) d->turned_parts[q * BLOCK + r] = part[r * w->along * LANES + q];
+                multiply_block(d->turned_parts, BLOCK, (odd ? &w->sines : &w->cosines)->table_back[n], w->upright, quarter, w->upright,
+                               d->block[n]);
+            }
+            const int64_t at = j < quarter ? j : 2 * quarter - 1 - j;
+            const REAL sign = j < quarter ? 1 : -1;
+            REAL *set[4];
+            for (int n = 0; n < 4; n++) set[n] = (REAL *)(d->sets[n] + at * w->folded) + odd * 2 * inner;
+            for (int64_t m = 0; m < inner; m++)
                 for (int n = 0; n < 2; n++) {
-                    const REAL a = high[n * w->upright * LANES + m], b = low[n * w->upright * LANES + m];
-                    even_row[2 * m + n] = a + b, odd_row[2 * m + n] = a - b;
+                    const REAL *block = (const REAL *)d->block[m % 2] + m / 2, high = block[n * pitch], low = block[(2 + n) * pitch];
+                    set[0][2 * m + n] += high + low, set[1][2 * m + n] += sign * (high + low);
+                    set[2][2 * m + n] += sign * (high - low), set[3][2 * m + n] += high - low;
                 }
         }
-    multiply(&w->cosines_back, d->even, w->folded, d->sum);
-    multiply(&w->sines_back, d->odd, w->folded, d->less);
-    unfold(w, (REAL *)grid_row(w, d->grids, k * extent), d);
+    for (int n = 0; n < 4; n++) {
+        const matrix *rows = (n < 2 ? &w->cosines : &w->sines)->rows_back + n % 2;
+        multiply(rows, d->sets[n], w->folded, d->rows_back);
+        for (int64_t i = n % 2; i < inner; i += 2)
+            memcpy(d->folded[n / 2] + i * w->folded, d->rows_back + i / 2 * w->folded, w->folded * sizeof(vec));
+    }
+    unfold(w, (REAL *)grid_row(w, d->grids, k * w->s->extent), d);
+}
+
+// Samples from the parts of their transform: on either side of the middle, and half a period away.
+INLINE void add_up(vec a, vec b, vec c, vec e, vec *x) {
+    x[0] = (a + b) + (c + e), x[1] = (a + b) - (c + e), x[2] = (a - b) + (e - c), x[3] = (a - b) - (e - c);
 }
 
 static void add_light(const work *w, REAL weight, const desk *d) {
     const int64_t half = w->s->samples / 2, vecs = w->along;
     for (int64_t j = 0; j < half; j++)
         for (int side = 0; side < 2; side++) {
-            vec *row = d->light + (side ? half - 1 - j : half + j) * 2 * vecs;
-            const vec *even = d->parts[0] + (j * BLOCK + 2 * side) * vecs, *odd = d->parts[1] + (j * BLOCK + 2 * side) * vecs;
+            vec *row = d->light + (side ? half - 1 - j : half + j) * 4 * vecs;
+            const int64_t at = (j * BLOCK + 2 * side) * vecs;
+            const vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at;
             for (int64_t v = 0; v < vecs; v++) {
-                const vec a = even[v], b = odd[v], c = even[vecs + v], e = odd[vecs + v];
-                row[v] += weight * ((a + b) * (a + b) + (c + e) * (c + e));
-                row[vecs + v] += weight * ((a - b) * (a - b) + (c - e) * (c - e));
+                vec re[4], im[4];
+                add_up(a[v], b[v], c[v], e[v], re);
+                add_up(a[vecs + v], b[vecs + v], c[vecs + v], e[vecs + v], im);
+#pragma GCC unroll 4
+                for (int n = 0; n < 4; n++) row[n * vecs + v] += weight * (re[n] * re[n] + im[n] * im[n]);
             }
         }
 }
 
 // Where a sample of y stands in a row of light.
 INLINE int64_t at_y(const work *w, int64_t y) {
-    const int64_t half = w->s->samples / 2;
-    return y < half ? w->along * LANES + half - 1 - y : y - half;
+    const int64_t half = w->s->samples / 2, side = y < half, k = side ? half - 1 - y : y - half, far = k >= w->s->quarter;
+    return (2 * far + side) * w->along * LANES + (far ? 2 * w->s->quarter - 1 - k : k);
 }
 
 static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL *out) {
     const int64_t window = w->s->window;
     for (int64_t v = 0; v < w->s->shifts; v++, out += window * window) {
-        multiply(pixels + 4 * v, d->light, 2 * w->along, d->lines);
+        multiply(pixels + 4 * v, d->light, 4 * w->along, d->lines);
         for (int64_t y = 0; y < w->s->samples; y++) {
             const REAL *line = (const REAL *)d->lines + at_y(w, y);
             REAL *turned = (REAL *)(d->turned_lines + y * w->beside);
-            for (int64_t p = 0; p < window; p++) turned[p] = line[p * 2 * w->along * LANES];
+            for (int64_t p = 0; p < window; p++) turned[p] = line[p * 4 * w->along * LANES];
         }
         multiply(pixels + 4 * v + 1, d->turned_lines, w->beside, d->pixels);
         for (int64_t q = 0; q < window; q++) memcpy(out + q * window, d->pixels + q * w->beside, window * sizeof(REAL));
@@ -450,17 +508,18 @@ static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL 
 
 // The transpose of it, to the gradient of the light.
 static void spread_pixels(const work *w, const matrix *pixels, const desk *d, const REAL *gradient) {
-    const int64_t window = w->s->window, size = w->s->samples * 2 * w->along;
+    const int64_t window = w->s->window, size = w->s->samples * 4 * w->along;
     memset(d->of_light, 0, size * sizeof(vec));
+    memset(d->lines, 0, window * 4 * w->along * sizeof(vec));
     for (int64_t v = 0; v < w->s->shifts; v++) {
         for (int64_t q = 0; q < window; q++, gradient += window) memcpy(d->pixels + q * w->beside, gradient, window * sizeof(REAL));
         multiply(pixels + 4 * v + 3, d->pixels, w->beside, d->turned_lines);
         for (int64_t y = 0; y < w->s->samples; y++) {
             REAL *line = (REAL *)d->lines + at_y(w, y);
             const REAL *turned = (const REAL *)(d->turned_lines + y * w->beside);
-            for (int64_t p = 0; p < window; p++) line[p * 2 * w->along * LANES] = turned[p];
+            for (int64_t p = 0; p < window; p++) line[p * 4 * w->along * LANES] = turned[p];
         }
-        multiply(pixels + 4 * v + 2, d->lines, 2 * w->along, d->light);
+        multiply(pixels + 4 * v + 2, d->lines, 4 * w->along, d->light);
         for (int64_t n = 0; n < size; n++) d->of_light[n] += d->light[n];
     }
 }
@@ -471,13 +530,16 @@ static REAL light_gradient(const work *w, REAL weight, const desk *d) {
     vec total = {0};
     for (int64_t j = 0; j < half; j++)
         for (int side = 0; side < 2; side++) {
-            const vec *row = d->of_light + (side ? half - 1 - j : half + j) * 2 * vecs;
+            const vec *row = d->of_light + (side ? half - 1 - j : half + j) * 4 * vecs;
             for (int64_t v = 0; v < 2 * vecs; v++) {  // real parts, then imaginary ones
                 const int64_t at = (j * BLOCK + 2 * side) * vecs + v, y = v < vecs ? v : v - vecs;
-                vec *a = d->parts[0] + at, *b = d->parts[1] + at;
-                const vec high = *a + *b, low = *a - *b, up = row[y] * high, down = row[vecs + y] * low;
-                total += up * high + down * low;
-                *a = 2 * weight * (up + down), *b = 2 * weight * (up - down);
+                vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at, x[4], of[4];
+                add_up(*a, *b, *c, *e, x);
+#pragma GCC unroll 4
+                for (int n = 0; n < 4; n++) of[n] = row[n * vecs + y] * x[n], total += of[n] * x[n];
+                const vec sum = of[0] + of[1], less = of[0] - of[1], far_sum = of[2] + of[3], far_less = of[2] - of[3];
+                *a = 2 * weight * (sum + far_sum), *b = 2 * weight * (sum - far_sum);
+                *c = 2 * weight * (less - far_less), *e = 2 * weight * (less + far_less);
             }
         }
     return sum_of(total);
@@ -505,34 +567,39 @@ static void gather_waves(const work *w, const desk *d, REAL *of_waves) {
 // Shares memory out to a thread's desk, and returns the number of vectors that it takes.
 static int64_t share_out(const work *w, vec *memory, desk *d) {
     const scattered *s = w->s;
-    const int64_t half = s->extent / 2, samples = padded(s->samples, BLOCK), transformed = padded(s->samples / 2, BLOCK);
-    const int64_t block = s->samples / 2 * half * BLOCK / LANES + 3, part = s->samples / 2 * BLOCK * w->along;
+    const int64_t inner = s->extent / 2 + 1, samples = padded(s->samples, BLOCK), folded = inner * w->folded + 1;
+    const int64_t set = padded(s->quarter, BLOCK) * w->folded + 1, block = 2 * s->quarter * w->block / LANES;
+    const int64_t part = s->samples / 2 * BLOCK * w->along;
     const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
                              s->exposures * s->states * s->extent * w->across + 1,
                              w->rows * w->vecs,
                              w->rows * w->vecs,
-                             padded(half, BLOCK) * w->folded + 1,
-                             padded(half, BLOCK) * w->folded + 1,
-                             transformed * w->folded + 1,
-                             transformed * w->folded + 1,
-                             block,
-                             block,
-                             part,
-                             part,
-                             samples * 2 * w->along,
-                             padded(s->window, BLOCK) * 2 * w->along,
+                             2 * folded,
+                             4 * set,
+                             2 * block,
+                             4 * part,
+                             samples * 4 * w->along,
+                             padded(s->window, BLOCK) * 4 * w->along,
                              samples * w->beside,
                              padded(s->window, BLOCK) * w->beside,
-                             samples * 2 * w->along,
-                             s->samples / 2 * BLOCK / LANES + 1,
-                             BLOCK * w->upright};
-    enum { PARTS = sizeof sizes / sizeof *sizes };
-    vec *at[PARTS];
-    int64_t total = 0;
-    for (int n = 0; n < PARTS; total += sizes[n++]) at[n] = memory ? memory + total : 0;
-    *d = (desk){(REAL *)at[0], at[1],  at[2],  at[3],  at[4],  at[5],  at[6],           at[7],  {(REAL *)at[8], (REAL *)at[9]},
-                {at[10], at[11]}, at[12], at[13], at[14], at[15], at[16], (REAL *)at[17], at[18]};
-    return total;
+                             samples * 4 * w->along,
+                             s->quarter * BLOCK / LANES + 1,
+                             2 * BLOCK * w->upright,
+                             padded((inner + 1) / 2, BLOCK) * w->folded};
+    enum { ALL = sizeof sizes / sizeof *sizes };
+    int64_t at[ALL + 1] = {0};
+    for (int n = 0; n < ALL; n++) at[n + 1] = at[n] + sizes[n];
+    if (memory) {
+        *d = (desk){.field = (REAL *)memory, .grids = memory + at[1], .patch = memory + at[2], .turned = memory + at[3],
+                    .light = memory + at[8], .lines = memory + at[9], .turned_lines = memory + at[10], .pixels = memory + at[11],
+                    .of_light = memory + at[12], .turned_parts = (REAL *)(memory + at[13]), .rows_back = memory + at[15]};
+        for (int n = 0; n < 2; n++) {
+            d->folded[n] = memory + at[4] + n * folded, d->blocks[n] = (REAL *)(memory + at[6] + n * block);
+            d->block[n] = memory + at[14] + n * BLOCK * w->upright;
+        }
+        for (int n = 0; n < 4; n++) d->sets[n] = memory + at[5] + n * set, d->parts[n] = memory + at[7] + n * part;
+    }
+    return at[ALL];
 }
 
 // One depth of a place: its light, or the gradients, which are added to `of_waves` and `of_weights`.
@@ -547,7 +614,7 @@ static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves,
     for (int64_t e = 0; e < s->exposures; e++) {
         const matrix *pixels = w->pixels + 4 * e * s->shifts;
         if (s->gradient) spread_pixels(w, pixels, d, s->gradient + out + e * size);
-        else memset(d->light, 0, s->samples * 2 * w->along * sizeof(vec));
+        else memset(d->light, 0, s->samples * 4 * w->along * sizeof(vec));
         for (int64_t k = 0; k < s->states; k++) {
             transform_state(w, e * s->states + k, d);
             if (!s->gradient) add_light(w, s->weights[k], d);
@@ -569,12 +636,11 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     w->rows = padded(w->tall, ROWS), w->vecs = (2 * w->tall + LANES - 1) / LANES;
     const int64_t most = 2 * (s->extent - w->tall) + w->vecs * LANES;
     w->across = ((most > 2 * s->extent ? most : 2 * s->extent) + LANES - 1) / LANES;
-    w->folded = (2 * s->extent + LANES - 1) / LANES;
+    w->folded = (2 * s->extent + 2 + LANES - 1) / LANES, w->block = 2 * padded(s->extent + 1, LANES);
     w->beside = (s->window + LANES - 1) / LANES;
     w->row_weights = malloc(total * w->rows * sizeof(REAL));
     w->column_weights = aligned_alloc(sizeof(vec), total * w->vecs * sizeof(vec));
-    desk none;
-    w->size = share_out(w, 0, &none);
+    w->size = share_out(w, 0, 0);
     w->desks = aligned_alloc(sizeof(vec), s->threads * w->size * sizeof(vec));
     const int status = w->row_weights && w->column_weights && w->desks ? 0 : NO_MEMORY;
     if (!status) {
@@ -606,28 +672,22 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
 // The light, or with a gradient of it those of waves and weights. Returns 0, NO_MEMORY, or OUTSIDE where points lie beyond
 // the grid.
 int scattered_light(const scattered *s) {
-    const int64_t half = s->samples / 2, spread = s->extent / 2;
-    const int64_t tables = 2 * (matrix_size(half, spread) + matrix_size(spread, half)),
+    const int64_t most = s->extent / 4 + 1, quarter = s->quarter;  // even or odd rows
+    const int64_t rows = 4 * (matrix_size(quarter, most) + matrix_size(most, quarter)),
                   pixels = 2 * s->exposures * s->shifts * (matrix_size(s->window, s->samples) + matrix_size(s->samples, s->window));
-    work own = {.s = s}, *w = &own;
-    char *matrices = malloc(tables + pixels);
-    w->along = (half + LANES - 1) / LANES, w->upright = (spread + LANES - 1) / LANES;
-    w->cosine_table = aligned_alloc(sizeof(vec), 2 * (spread * w->along + half * w->upright + 1) * sizeof(vec));
+    work own = {.s = s, .along = (quarter + LANES - 1) / LANES, .upright = (most + LANES - 1) / LANES}, *w = &own;
+    char *matrices = malloc(rows + pixels), *rest = matrices;
+    vec *tables = aligned_alloc(sizeof(vec), 4 * (2 * quarter * most / LANES + 1 + most * w->along + quarter * w->upright) * sizeof(vec)),
+        *beyond = tables;
     w->start = malloc(2 * s->patches * sizeof(int64_t) + 1);
     w->pixels = malloc(4 * s->exposures * s->shifts * sizeof(matrix) + 1);
     REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->exposures * s->cells + 1) * sizeof(REAL) + 1) : 0;
-    int status = matrices && w->cosine_table && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
+    int status = matrices && tables && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
     if (!status) {
-        char *rest = lay_out(&w->cosines, s->cosines, half, spread, 0, matrices);
-        rest = lay_out(&w->sines, s->sines, half, spread, 0, rest);
-        rest = lay_out(&w->cosines_back, s->cosines, spread, half, 1, rest);
-        rest = lay_out(&w->sines_back, s->sines, spread, half, 1, rest);
-        w->sine_table = spread_out(s->cosines, spread, half, 1, w->cosine_table);
-        w->cosine_table_back = spread_out(s->sines, spread, half, 1, w->sine_table);
-        w->sine_table_back = spread_out(s->cosines, half, spread, 0, w->cosine_table_back);
-        spread_out(s->sines, half, spread, 0, w->sine_table_back);
+        lay_out_axes(s, s->cosines, w->along, w->upright, &w->cosines, &rest, &beyond);
+        lay_out_axes(s, s->sines, w->along, w->upright, &w->sines, &rest, &beyond);
         for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(w, place, rest, parts);
     }
-    free(matrices), free(w->cosine_table), free(w->start), free(w->pixels), free(parts);
+    free(matrices), free(tables), free(w->start), free(w->pixels), free(parts);
     return status;
 }

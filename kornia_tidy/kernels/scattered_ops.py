@@ -44,12 +44,16 @@ class Points(NamedTuple):
 
 
 class Transform(NamedTuple):
-    """Kernel that spreads points on a grid, and the transform T of the grid, split by its symmetry.
+    """Kernel that spreads points on a grid, and the transform T of the grid, split by its symmetries.
+
+    Rows of the grid and samples lie evenly about their middles. T is periodic: half a period of 2 L samples away from a
+    sample that lies k + 1/2 from the middle is that at k + 1/2 - L.
 
     Args:
         width: of the kernel in samples of the grid.
         kernel: its value as a polynomial in :math:`1 - t^2`, with t from -1 to 1 over its width, (n,).
-        cosines: real part of T for sums of rows of the grid that lie mirrored about its middle, (Q / 2, M / 2).
+        cosines: real part of T for sums of rows of the grid that lie mirrored about its middle, (L / 2, (M + 1) / 2),
+            for samples of the first quarter of a period.
         sines: imaginary part of T for their differences, negative.
     """
 
@@ -89,7 +93,8 @@ def scattered_light_by_torch(
 ) -> Tensor:
     """Return the same by plain operations, on any device, see :func:`scattered_light`."""
     width, kernel, cosines, sines = transform
-    extent, found = 2 * cosines.shape[1], []
+    extent, found = 2 * cosines.shape[1] - 1, []
+    transform = whole_transform(cosines, sines, rows.shape[-1])
     own, phases = waves[..., points.cell], points.phase_terms.shape[1]
     for values, down, right in zip(points.values, rows, columns, strict=True):
         (top, below), (left, beside) = (_spread(place, width, kernel, extent) for place in values[:2])
@@ -101,8 +106,8 @@ def scattered_light_by_torch(
             parts = (below.mT @ (part.to(kernel.dtype)[..., None] * beside) for part in (field.real, field.imag))
             flat = (own[..., None, None] * torch.complex(*parts)).flatten(2)
             grid = flat.new_zeros(*own.shape[:2], extent**2).index_add(2, index, flat).unflatten(2, (extent, extent))
-            sample = _transformed(_transformed(grid, cosines, sines).mT, cosines, sines)  # columns first
-            light = torch.einsum("k,ekxy->eyx", weights, sample.real.square() + sample.imag.square())
+            sample = transform @ grid @ transform.mT
+            light = torch.einsum("k,ekyx->eyx", weights, sample.real.square() + sample.imag.square())
             found.append(down @ light[:, None] @ right.mT)
     shape = len(rows), len(points.phase_terms), *rows.shape[1:4], columns.shape[3]
     return torch.stack(found).view(shape)
@@ -123,15 +128,22 @@ def _spread(place: Tensor, width: int, kernel: Tensor, extent: int) -> tuple[Ten
     return start, torch.where(inside > 0, value, 0.0).to(kernel.dtype)
 
 
-def _transformed(grid: Tensor, cosines: Tensor, sines: Tensor) -> Tensor:
-    """Return the samples of the transform of rows, (..., M, X) to (..., Q, X)."""
-    low, high = grid.chunk(2, -2)
-    low = low.flip(-2)
-    even, odd = (
-        torch.view_as_complex((part @ torch.view_as_real(own.contiguous()).flatten(-2)).unflatten(-1, (-1, 2)))
-        for part, own in ((cosines, high + low), (sines, (high - low) * -1j))
-    )
-    return torch.cat([(even - odd).flip(-2), even + odd], -2)
+def whole_transform(cosines: Tensor, sines: Tensor, samples: int) -> Tensor:
+    """Return T as a complex matrix, (Q, M), see :class:`Transform`.
+
+    Example:
+        >>> whole_transform(torch.ones(1, 2), torch.zeros(1, 2), 4).real
+        tensor([[-1.,  1., -1.],
+                [ 1.,  1.,  1.],
+                [ 1.,  1.,  1.],
+                [-1.,  1., -1.]])
+    """
+    signs = 1 - 2 * (torch.arange(cosines.shape[1], device=cosines.device) % 2)
+    even, odd = torch.cat([cosines, (signs * cosines).flip(0)]), torch.cat([sines, (-signs * sines).flip(0)])
+    upper = torch.cat([torch.complex(even, odd)[:, 1:].flip(1), torch.complex(even, -odd)], 1)[: samples // 2]
+    middle = cosines.shape[1] - 1
+    upper[:, middle] = upper[:, middle].real + 0j  # its own mirror image: it has no difference
+    return torch.cat([upper.flip(0).conj(), upper])
 
 
 class _Scattered(Parameters):
@@ -139,11 +151,8 @@ class _Scattered(Parameters):
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in ("places", "depths", "exposures", "states", "cells", "patches", "points")),
-        *(
-            (name, ctypes.c_int64)
-            for name in ("phases", "amplitudes", "width", "degree", "extent", "samples", "shifts")
-        ),
-        *((name, ctypes.c_int64) for name in ("window", "threads")),
+        *((name, ctypes.c_int64) for name in ("phases", "amplitudes", "width", "degree", "extent", "quarter")),
+        *((name, ctypes.c_int64) for name in ("samples", "shifts", "window", "threads")),
         *((name, ctypes.c_void_p) for name in ("cell", "values", "phase_terms", "amplitude_terms", "kernel", "waves")),
         *((name, ctypes.c_void_p) for name in ("weights", "cosines", "sines", "rows", "columns", "gradient", "light")),
         *((name, ctypes.c_void_p) for name in ("of_waves", "of_weights")),
@@ -196,11 +205,14 @@ def _new_light(
         )
     if cosines.ndim != 2 or cosines.shape != sines.shape:
         raise ValueError(f"cosines and sines must have one shape, got {tuple(cosines.shape)} and {tuple(sines.shape)}")
-    if rows.ndim != 5 or rows.shape != columns.shape or rows.shape[1::3] != (len(waves), 2 * len(cosines)):
-        wanted = f"(F, {len(waves)}, V, P, {2 * len(cosines)})"
+    most = 4 * len(cosines)
+    if rows.ndim != 5 or rows.shape != columns.shape or rows.shape[1] != len(waves):
         raise ValueError(
-            f"rows and columns must have shape {wanted}, got {tuple(rows.shape)} and {tuple(columns.shape)}"
+            f"rows and columns must have shape (F, {len(waves)}, V, P, Q), got {tuple(rows.shape)} and "
+            f"{tuple(columns.shape)}"
         )
+    if rows.shape[4] % 2 or rows.shape[4] > most:
+        raise ValueError(f"rows and columns must have an even number of at most {most} samples, got {rows.shape[4]}")
     return weights.new_empty(len(rows), depths, *rows.shape[1:4], rows.shape[3])
 
 
@@ -245,8 +257,9 @@ def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
         amplitudes=amplitude_terms.shape[1],
         width=width,
         degree=len(kernel) - 1,
-        extent=2 * cosines.shape[1],
-        samples=2 * len(cosines),
+        extent=2 * cosines.shape[1] - 1,
+        quarter=len(cosines),
+        samples=rows.shape[4],
         shifts=rows.shape[2],
         window=rows.shape[3],
     )
@@ -267,7 +280,7 @@ def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
     )
     status = load(SOURCE, weights.dtype).scattered_light(ctypes.byref(scattered))
     if status == _OUTSIDE:
-        raise ValueError(f"points must lie in the grid of {2 * cosines.shape[1]} samples")
+        raise ValueError(f"points must lie in the grid of {2 * cosines.shape[1] - 1} samples")
     if status == _NO_MEMORY:
         raise MemoryError(f"no memory for PSFs of {rows.shape[2]}x{rows.shape[2]} pixels")
 

@@ -3,9 +3,10 @@ r"""Fourier transform of scattered points to the light in the pixels of a sensor
 .. math:: I(p) = \int_p \Big| \sum_j c_j e^{-2\pi i (\nu_j X + \mu_j Y)} \Big|^2 dX \, dY
 
 The points are spread on a small grid with a kernel of a few samples, transformed along either axis by a matrix, and the
-kernel's transform is divided out: a nonuniform transform of type 1. Grid and samples lie evenly about their middles, so
-that sums and differences of mirrored rows are transformed by real matrices of half the size. The samples of the
-intensity lie denser than its bandwidth asks, so that the integral over a pixel is a short sum of them.
+kernel's transform is divided out: a nonuniform transform of type 1. Grid and samples lie evenly about their middles,
+so that sums and differences of mirrored rows are transformed by real matrices, of even and odd rows apart for a quarter
+of the period. The samples of the intensity lie denser than its bandwidth asks, so that the integral over a pixel is a
+short sum of them.
 
 Source: Barnett, Magland and af Klinteberg, SIAM J. Sci. Comput. 41(5) C479 (2019), for the transform; Kaiser's window
 for the kernel and for the interpolation between samples.
@@ -38,11 +39,12 @@ class Grid:
 
     Args:
         step: cycles per pixel from sample to sample.
-        extent: samples M, even; frequency zero is in their middle.
+        extent: samples M, odd; frequency zero is the middle one.
         width: samples that a point is spread on.
         kernel: the spreading kernel as a polynomial in 1 - x^2, with x from -1 to 1 over its width, (n,) float64.
-        cosines: transform of sums of mirrored rows, (N / 2, M / 2) float64, over the kernel's transform.
+        cosines: transform of sums of mirrored rows, (L / 2, (M + 1) / 2) float64, for a period of 2 L samples.
         sines: the same of differences.
+        correction: one over the square of the kernel's transform at the N samples of the intensity, float64.
         spacing: pixels from sample to sample of the intensity; N, even, lie about the middle of the window.
         reach: samples to either side that the interpolation between samples takes.
         decay: of its window.
@@ -54,6 +56,7 @@ class Grid:
     kernel: Tensor
     cosines: Tensor
     sines: Tensor
+    correction: np.ndarray
     spacing: float
     reach: int
     decay: float
@@ -77,11 +80,11 @@ class Grid:
         return found.flip(-1) if mirrored else found
 
     def _shifted(self, window: int, shifts: tuple[float, ...]) -> Tensor:
-        count = 2 * len(self.cosines)
+        count = len(self.correction)
         at = np.arange(count) - (count - 1) / 2
         edges = np.arange(window + 1) - window / 2 - np.array(shifts)[:, None]
         within = _interpolant_integral(edges[..., None] / self.spacing - at, self.reach, self.decay)
-        return torch.from_numpy(self.spacing * np.diff(within, axis=1))
+        return torch.from_numpy(self.spacing * np.diff(within, axis=1) * self.correction)
 
 
 @lru_cache(maxsize=32)
@@ -96,8 +99,8 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
 
     Example:
         >>> grid = scattered_grid(0.3, 9, 1e-3)
-        >>> grid.extent, 2 * len(grid.cosines), grid.sums(9, torch.zeros(2, 1)).shape
-        (22, 28, torch.Size([2, 1, 9, 28]))
+        >>> grid.extent, grid.cosines.shape, grid.sums(9, torch.zeros(2, 1)).shape
+        (21, torch.Size([9, 11]), torch.Size([2, 1, 9, 28]))
     """
     span = max(2 * highest, 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH))
@@ -106,14 +109,15 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
     reach = math.ceil(math.hypot(decay, math.pi) / (math.pi * (1 - lit / _DENSITY)))
     spacing = 1 / (2 * _DENSITY * span)
     half = math.ceil((window / 2 + math.ceil(shift / _STEP) * _STEP) / spacing) + reach
-    step = 1 / (2 * _SIGMA * half * spacing)
-    extent = 2 * math.ceil((span / step + width + 1) / 2)
-    at = np.arange(half) + 0.5
-    correction = 1 / _spread_transform(at * spacing * step, width)
-    turns = 2 * math.pi * spacing * step * at[:, None] * (np.arange(extent // 2) + 0.5)
-    cosines, sines = (torch.from_numpy(correction[:, None] * part) for part in (np.cos(turns), np.sin(turns)))
+    quarter = math.ceil(_SIGMA * half / 2)
+    step = 1 / (4 * quarter * spacing)
+    extent = 2 * math.ceil((span / step + width) / 2) + 1
+    at = np.abs(np.arange(2 * half) + 0.5 - half)
+    correction = _spread_transform(at * spacing * step, width) ** -2.0
+    turns = 2 * math.pi * spacing * step * (np.arange(quarter)[:, None] + 0.5) * np.arange(extent // 2 + 1)
+    cosines, sines = torch.from_numpy(np.cos(turns)), torch.from_numpy(np.sin(turns))
     kernel = torch.from_numpy(_kernel(width))
-    return Grid(step, extent, width, kernel, cosines, sines, spacing, reach, decay)
+    return Grid(step, extent, width, kernel, cosines, sines, correction, spacing, reach, decay)
 
 
 def scattered_energies(

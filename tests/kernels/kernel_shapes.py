@@ -436,12 +436,19 @@ def scattered_written_out(
     coefficients times their powers bound, and so is the phase, by less than six roundings of a radian.
     """
     dtype, phases = weights.dtype if kernel.dtype == torch.float64 else kernel.dtype, phase_terms.shape[1]
-    extent, patches, points = 2 * cosines.shape[1], *values.shape[2:]
+    extent, patches, points = 2 * cosines.shape[1] - 1, *values.shape[2:]
     powers = torch.arange(len(kernel), dtype=torch.float64)
     lines = torch.arange(extent, dtype=torch.float64)
-    even, odd = cosines.double(), sines.double()
-    upper = torch.cat([even.flip(1) + 1j * odd.flip(1), even - 1j * odd], 1)  # samples and rows lie about their middles
-    whole = torch.cat([upper.flip(0).conj(), upper])
+    whole = torch.zeros(rows.shape[-1], extent, dtype=torch.complex128)
+    for n in range(len(whole)):  # samples and rows lie about their middles
+        k, side = (n - len(whole) // 2, 1) if n >= len(whole) // 2 else (len(whole) // 2 - 1 - n, -1)
+        far = k >= len(cosines)
+        for m in range(extent):
+            i = abs(m - extent // 2)
+            at = (2 * len(cosines) - 1 - k if far else k), i
+            sign = (-1) ** i if far else 1
+            turn = side * ((m > extent // 2) - (m < extent // 2)) * (-sign if far else 1)
+            whole[n, m] = sign * cosines[at].double() - 1j * turn * sines[at].double()
     large = whole.real.abs() + whole.imag.abs()
     found, allowed = [], []
     roundings = points * patches + 2 * extent + 2 * len(weights) + len(whole) + 8 * len(kernel) + 64
@@ -653,8 +660,9 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
     exposures = draw.randint(1, 3)
     phases, amplitudes, window = draw.randint(1, 3), draw.randint(1, 2), draw.choice((1, 3, 5, 9, 23))
     wide = draw.choice((0.0, 0.5, 2.0, 12.0))  # of a patch, in samples of the grid
-    extent = 2 * (draw.randint(0, 8) + math.ceil((width + wide + 1) / 2))
-    samples = 2 * draw.randint(1, 20)
+    extent = 2 * (draw.randint(0, 8) + math.ceil((width + wide + 1) / 2)) + 1
+    quarter = draw.randint(1, 14)
+    samples = 2 * draw.randint(1, 2 * quarter)
     corners = (width - 1) / 2 + torch.rand(places, 2, patches, 1, dtype=torch.float64) * (extent - width - wide)
     at = corners + wide * torch.rand(places, 2, patches, points, dtype=torch.float64)
     rest = torch.randn(places, phases + amplitudes, patches, points, dtype=torch.float64)
@@ -672,14 +680,14 @@ def _scattered(draw: random.Random) -> tuple[tuple[Any, ...], str, int]:
         torch.randn(depths, amplitudes, dtype=torch.float64),
         width,
         kernel,
-        torch.randn(samples // 2, extent // 2, dtype=dtype),
-        torch.randn(samples // 2, extent // 2, dtype=dtype),
+        torch.randn(quarter, extent // 2 + 1, dtype=dtype),
+        torch.randn(quarter, extent // 2 + 1, dtype=dtype),
         *sums,
     )
     about = (
         f"{dtype} exposures {exposures} states {states} cells {cells} patches {patches} points {points} "
-        f"places {places} depths {depths} shifts {shifts} width {width} extent {extent} samples {samples} "
-        f"window {window} wide {wide}"
+        f"places {places} depths {depths} shifts {shifts} width {width} extent {extent} quarter {quarter} "
+        f"samples {samples} window {window} wide {wide}"
     )
     transforms = exposures * states * samples * extent * (samples + extent)
     products = places * depths * (patches * points * extent**2 + transforms)

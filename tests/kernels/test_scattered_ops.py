@@ -95,7 +95,7 @@ class TestScatteredLight(OperatorTester):
             (1, lambda x: x.repeat(2), ValueError, r"waves and weights must have shapes \(E, K, N\) and \(K,\), got"),
             (3, lambda x: x[:, 1:], ValueError, "values must have shape .* for the terms, got"),
             (9, lambda x: x[1:], ValueError, "cosines and sines must have one shape, got"),
-            (10, lambda x: x[..., 1:], ValueError, r"rows and columns must have shape \(F, \d+, V, P, \d+\), got"),
+            (10, lambda x: x[..., 1:], ValueError, r"rows and columns must have shape \(F, \d+, V, P, Q\), got"),
         ],
     )
     def test_exception(self, at, change, error, words):
