@@ -94,7 +94,7 @@ def scattered_light_by_torch(
     """Return the same by plain operations, on any device, see :func:`scattered_light`."""
     width, kernel, cosines, sines = transform
     extent, found = 2 * cosines.shape[1] - 1, []
-    transform = whole_transform(cosines, sines, rows.shape[-1])
+    whole = whole_transform(cosines, sines, rows.shape[-1])
     own, phases = waves[..., points.cell], points.phase_terms.shape[1]
     for values, down, right in zip(points.values, rows, columns, strict=True):
         (top, below), (left, beside) = (_spread(place, width, kernel, extent) for place in values[:2])
@@ -106,7 +106,7 @@ def scattered_light_by_torch(
             parts = (below.mT @ (part.to(kernel.dtype)[..., None] * beside) for part in (field.real, field.imag))
             flat = (own[..., None, None] * torch.complex(*parts)).flatten(2)
             grid = flat.new_zeros(*own.shape[:2], extent**2).index_add(2, index, flat).unflatten(2, (extent, extent))
-            sample = transform @ grid @ transform.mT
+            sample = whole @ grid @ whole.mT
             light = torch.einsum("k,ekyx->eyx", weights, sample.real.square() + sample.imag.square())
             found.append(down @ light[:, None] @ right.mT)
     shape = len(rows), len(points.phase_terms), *rows.shape[1:4], columns.shape[3]
