@@ -71,6 +71,12 @@ class TestFewerWavelengths(BaseTester):
         many = Spectrum((400e-9, 500e-9, 510e-9, 600e-9), ((0, 1, 1, 0), (0, 0, 0, 1)))
         assert bin_spectrum(many, 3).wavelengths == pytest.approx((500e-9, 510e-9, 600e-9))
 
+    def test_feature_colours_with_spectra_stay_what_they_are(self):
+        """A basis is checked where a spectrum is made; grey stays flat."""
+        few = bin_spectrum(camera_spectrum(samples=31, reflectance=True), 7)
+        np.testing.assert_allclose(np.sum(few.basis, 0), 1, atol=1e-9)
+        assert len(few.basis[0]) == 7
+
     def test_feature_gradients_reach_the_masks(self):
         own = TiDyOptics(sensor=None, spectrum=MANY, fidelity=Fidelity(window=9, wavelengths=2))
         own(torch.rand(3, 24, 24), torch.full((1, 24, 24), 0.5)).square().mean().backward()
