@@ -137,6 +137,9 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
 
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+    if value.layout != torch.strided or value.is_nested:
+        layout = "nested" if value.is_nested else value.layout
+        raise TypeError(f"{name} must be a dense tensor, got a {layout} one: convert it, as to_dense() does")
     if not value.is_floating_point():
         unit = {"depth": " in metres", "image": " with values in [0, 1]"}.get(name.removesuffix("s"), "")
         raise TypeError(f"{name} must be floating point{unit}, got {value.dtype}{_as_float(name, value)}")

@@ -42,7 +42,7 @@ class Mode(Flag):
     UNREAD = auto()
     """Values of an accelerator's tensors should be left unread, as the host would wait: see :func:`values_unread`."""
     GRAPH = auto()
-    """Values of tensors are unknown: ``torch.compile``, ``torch.export``, ``torch.jit.trace`` and ``torch.vmap``."""
+    """Values of tensors are unknown: ``torch.compile``, ``export``, ``jit.trace``, ``make_fx`` and ``torch.vmap``."""
     TRANSFORM = auto()
     """Transforms of ``torch.func`` or forward-mode derivatives, compiled or not: C kernels have no rules for them."""
     TRACED = GRAPH | TRANSFORM
@@ -65,7 +65,7 @@ def torch_mode() -> Mode:
         tensor([1., 1.])
     """
     functorch = torch._C._functorch
-    unknown = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    unknown = torch.compiler.is_compiling() or torch.jit.is_tracing() or _is_recorded()
     # While compiling, the empty stack is a proxy of None, so a comparison with None would fail.
     nested = isinstance(functorch.peek_interpreter_stack(), functorch.CInterpreter)
     if nested and not unknown:
@@ -73,6 +73,11 @@ def torch_mode() -> Mode:
     if nested or forward_ad._current_level >= 0:
         return Mode.TRACED if unknown else Mode.TRANSFORM
     return Mode.GRAPH if unknown else _thread.mode
+
+
+def _is_recorded() -> bool:
+    """Return whether operations are recorded as a graph by ``make_fx``, as ``torch.func.linearize`` does."""
+    return torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is not None
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, PITCHES, ThinLensCamera
+from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, NEAREST_DEPTH, PITCHES, ThinLensCamera
 from kornia_tidy.optics.units import check_depth_fits, check_image, misread_depth, warn_once
 from kornia_tidy.render.compositing import render
 
@@ -54,7 +54,8 @@ def blur_radius(
         \qquad s' = \left( \frac{1}{f} - \frac{1}{z_f} \right)^{-1}
 
     Args:
-        depth: distance z in metres, any shape; ``inf`` is allowed.
+        depth: distance z in metres, any shape; ``inf`` is allowed. Those below 1e-18 m count as that, with a gradient
+            of 0.
         focus_distance: distance z_f in focus, in metres; a tensor must broadcast with the depth.
         f_number: N, focal length over aperture diameter.
         focal_length: f in metres.
@@ -70,7 +71,8 @@ def blur_radius(
         tensor([ 20.6000,   0.0000, -20.6000])
     """
     image_distance = 1 / (1 / focal_length - 1 / focus_distance)
-    return focal_length / (2 * f_number * pixel_pitch) * image_distance * (depth.reciprocal() - 1 / focus_distance)
+    inverse = depth.clamp(min=NEAREST_DEPTH).reciprocal()
+    return focal_length / (2 * f_number * pixel_pitch) * image_distance * (inverse - 1 / focus_distance)
 
 
 def depth_blur(
@@ -181,7 +183,7 @@ def _check_lens(
     """Raise an error unless these settings are those of a lens."""
     check_choice("color_space", color_space, COLOR_SPACES)
     check_choice("compositing", compositing, COMPOSITING)
-    nearest, fastest = (float(v.min()) if isinstance(v, Tensor) else v for v in (focus_distance, f_number))
+    nearest, fastest = (float(v.detach().min()) if isinstance(v, Tensor) else v for v in (focus_distance, f_number))
     check_positive("f_number", fastest)
     check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
     check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
@@ -233,7 +235,12 @@ def _discs_each_e(max_radius: float) -> float:
 
 def _discs(layer: Tensor, channels: int, max_radius: float) -> SimpleNamespace:
     """Return the discs around the layers of a scene, as the renderer reads PSFs."""
-    first, last = (round(float(end), 4) for end in torch.aminmax(layer.detach()))  # the largest may be off by rounding
+    if Mode.GRAPH in torch_mode() and not torch.compiler.is_compiling():  # vmap, which shows no values
+        last = disc_layer(torch.tensor(max_radius, dtype=torch.float64), max_radius)
+        ends = -last, last
+    else:
+        ends = torch.aminmax(layer.detach())
+    first, last = (round(float(end), 4) for end in ends)  # the largest may be off by rounding
     numbers = range(math.floor(first), math.ceil(last) + 1)
     radii = [disc_radius(number, max_radius) for number in numbers]
     side = 2 * math.ceil(round(max(radii), 4)) + 1

@@ -12,6 +12,7 @@ from kornia_tidy.camera.holes import fills_holes
 from kornia_tidy.camera.strips import Strip
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.holes import HOLES, fill_holes
 from kornia_tidy.psf.field import Field, check_centers
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -82,8 +83,8 @@ class LinearCamera(nn.Module):
         """Return the irradiance A x of linear light x."""
         check_float_tensor("light", light, 4, "(B, C, H, W)")
         self._check("light", light, (self.depth.shape[-2], self.depth.shape[-1]))
-        if self._fields(len(light)):
-            return self._through_lens(light)
+        if self._fields(len(light)) or Mode.TRANSFORM in torch_mode():
+            return self._blurred(light)
         scene, options = self._scene(light.shape[1], light.dtype)
         image = light.to(scene[0].dtype)
         return torch.ops.kornia_tidy.render_layers(image, *scene, *options).to(light.dtype)
@@ -94,8 +95,11 @@ class LinearCamera(nn.Module):
         cut = self.optics.window - 1 if self.optics.border == "valid" else 0
         rows, columns = self.depth.shape[-2:]
         self._check("irradiance", irradiance, (rows - cut, columns - cut))
+        if Mode.TRANSFORM in torch_mode():
+            dark = irradiance.new_zeros(*irradiance.shape[:2], rows, columns)
+            return torch.func.vjp(self.forward, dark)[1](irradiance)[0]
         if self._fields(len(irradiance)):
-            return _Transpose.apply(irradiance, self._through_lens, (rows, columns))
+            return _Transpose.apply(irradiance, self._blurred, (rows, columns))
         scene, options = self._scene(irradiance.shape[1], irradiance.dtype)
         plain = [part if part is None else part.detach() for part in scene]
         return _Adjoint.apply(irradiance.to(plain[0].dtype), *plain, *options).to(irradiance.dtype)
@@ -107,7 +111,7 @@ class LinearCamera(nn.Module):
         found = [self.optics.psf_model.field_of(size, center) for center in centers]
         return tuple(field for field in found if field is not None)
 
-    def _through_lens(self, light: Tensor) -> Tensor:
+    def _blurred(self, light: Tensor) -> Tensor:
         optics, dtype = self.optics, self._dtype(light.dtype)
         defocus = optics.defocus(self.depth.to(dtype))
         strip = Strip(light.to(dtype), defocus, defocus, optics.border, fields=self._fields(len(light)))

@@ -74,8 +74,9 @@ def sensor_noise(
     well, sigma, dark = (
         _of_rows(name, value, image, dtype) for name, value in zip(names, (full_well, read_noise, dark), strict=True)
     )
-    if not bool((well > dark).all()):
-        raise ValueError(f"full_well must be positive and above dark, got {full_well} and {dark} electrons")
+    if not bool((above := well > dark).all()):
+        pair = " and ".join(f"{float(rows[~above][0]):g}" for rows in torch.broadcast_tensors(well, dark))
+        raise ValueError(f"full_well must be positive and above dark, got {pair} electrons")
     if params is None:
         both = SensorNoise(1.0, full_well=1.0)
         params = both.draw(image.shape, device=image.device, generator=generator, dtype=dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -246,6 +247,7 @@ class CameraState(nn.Module):
             saved = {**saved, "fidelity": own}
         take_over(self, saved, self.settings(), {name: name for name in (*PARTS, "aperture", *OWN_SETTINGS)})
         self.psf_model = self.psf_model.with_window(None)
+        self.psf_model.check_layers()
 
     def get_extra_state(self) -> Tensor:
         """Return settings and window, uint8."""
@@ -279,7 +281,7 @@ class CameraState(nn.Module):
             strict: refuse missing and unknown weights.
             assign: as in PyTorch.
             take_over: set the settings of this camera's parts to those in the state first, where they differ. Parts of
-                another class are not made: they are refused, and nothing is changed.
+                another class are not made: they are refused. After any error nothing is changed.
 
         Returns:
             The missing and the unknown keys, as in PyTorch.
@@ -301,7 +303,14 @@ class CameraState(nn.Module):
                     f"there are no settings to take over: the state has no entry {EXTRA_STATE!r}, only "
                     f"{', '.join(state_dict) or 'nothing'}"
                 )
-            self._take_over(read_settings(state_dict[EXTRA_STATE]))
+            from kornia_tidy.camera.saved_camera import check_parts  # noqa: PLC0415 (it makes cameras)
+
+            check_parts(state_dict, self.settings())
+            saved, rehearsal = read_settings(state_dict[EXTRA_STATE]), copy.deepcopy(self)
+            for camera in (rehearsal, self):  # so that an error changes nothing
+                camera._take_over(saved)
+                keys = nn.Module.load_state_dict(camera, state_dict, strict, assign)
+            return keys
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(

@@ -13,8 +13,10 @@ from torch import Tensor, nn
 
 from kornia_tidy import masks, modulator, optics, sensor
 from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks
+from kornia_tidy.masks.limits import CONSTRAINTS
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.materials import DISPERSIONS, Material
@@ -55,7 +57,7 @@ def camera_of_state(state: Mapping[str, Tensor]) -> TiDyOptics:
     window = settings.get("window")
     if not isinstance(window, int) or 36 * window**2 > MOST_PSFS:  # three colours at three depths
         raise ValueError(f"PSFs of the camera's state must take at most {MOST_PSFS >> 20} MiB, got window {window}")
-    parts["fidelity"] = parts["fidelity"].replace(window=window)  # so that it need not be measured
+    parts["fidelity"] = Fidelity.of(parts["fidelity"]).replace(window=window)  # so that it need not be measured
     if (amplitude := state.get("aperture.amplitude")) is not None:
         parts["aperture"] = nn.Parameter(amplitude.detach().clone().clamp(0, 1))
     if (lens := state.get(f"lens.{EXTRA_STATE}")) is not None:
@@ -101,6 +103,27 @@ def modulator_of_state(state: Mapping[str, Tensor]) -> nn.Module | None:
     return cast("nn.Module", _part("modulator", settings, state)) if known else None
 
 
+def check_parts(state: Mapping[str, Tensor], here: Mapping[str, Any]) -> None:
+    """Raise an error where a part of a saved camera differs from the present one, and cannot be made with its settings.
+
+    Of masks only the limits are checked, since a state may lack their weights; of classes that this package does not
+    offer, nothing.
+
+    Args:
+        state: as in :func:`camera_of_state`.
+        here: settings of the present camera.
+
+    Raises:
+        ValueError: if a part cannot be made.
+    """
+    settings = _settings(state)
+    if "masks" in settings and settings["masks"] != here["masks"]:
+        _check_limits(settings["masks"])
+    for name in ("camera", "modulator", "sensor", "spectrum", "fidelity"):
+        if name in settings and settings[name] != here[name] and _classes(settings[name]) <= {*KINDS, "Sequential"}:
+            _part(name, settings, state)
+
+
 def _settings(state: Mapping[str, Tensor]) -> dict[str, Any]:
     if EXTRA_STATE not in state:
         raise ValueError(f"the state has no entry {EXTRA_STATE!r}, only {', '.join(state)[:200] or 'nothing'}")
@@ -111,6 +134,8 @@ def _part(name: str, settings: Mapping[str, Any], state: Mapping[str, Tensor]) -
     """Return a part of a camera with its settings and weights."""
     weights = below(state, f"{name}.")
     try:
+        if name == "masks":
+            _check_limits(settings[name])
         with torch.random.fork_rng(devices=[]):
             part = _made(settings[name], weights, tuple(settings.get("mask_pixels", ())))
         if isinstance(part, nn.Module):
@@ -159,6 +184,13 @@ def _made(described: Any, weights: Mapping[str, Tensor], pixels: tuple[int, ...]
             inner = isinstance(value, Mapping | list)
             arguments[name] = _made(value, below(weights, f"{name}."), ()) if inner else value
     return kind(*parts, **arguments)
+
+
+def _check_limits(described: Any) -> None:
+    """Raise an error unless masks have a known constraint and a range of phase, which are set after they are made."""
+    if isinstance(described, Mapping):
+        check_choice("constraint", described.get("constraint"), CONSTRAINTS)
+        check_positive("max_phase", described.get("max_phase"), "radians")
 
 
 def _check_tables(weights: Mapping[str, Tensor], pixels: tuple[int, ...]) -> None:

@@ -1,8 +1,9 @@
-"""Precision of devices: Apple's mps has no float64, and some graphics processors of Intel have none either."""
+"""Precision: devices without float64, such as Apple's mps, and roots with finite gradients."""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 WITHOUT_FLOAT64 = {"mps"}  # types of devices
 
@@ -27,3 +28,15 @@ def widest(device: torch.device) -> torch.dtype:
         (torch.float64, torch.float32)
     """
     return torch.float64 if has_float64(device) else torch.float32
+
+
+def safe_sqrt(value: Tensor) -> Tensor:
+    """Return the square root, with a gradient of zero instead of infinity at zero.
+
+    Example:
+        >>> x = torch.tensor([0.0, 4.0], requires_grad=True)
+        >>> torch.autograd.grad(safe_sqrt(x).sum(), x)[0]
+        tensor([0.0000, 0.2500])
+    """
+    zero = value == 0
+    return torch.where(zero, 0, torch.where(zero, 1, value).sqrt())

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.precision import widest
+from kornia_tidy.mode import Mode, torch_mode
 
 # Expected electrons from which a Gaussian replaces the Poisson distribution. Its mean and variance are exact; its skew
 # is not. Rounded to whole electrons, it differs by 0.025 in total variation at this count (0.040 at 10, 0.018 at 50).
@@ -55,9 +56,9 @@ def poisson_quantile(rate: Tensor, uniform: Tensor) -> Tensor:
     count = torch.zeros_like(rate)
     for k in range(1, _MAX_COUNT + 1):
         more = uniform > below
-        if not _recording(rate) and not bool(more.any()):
+        if not _unread(rate) and not bool(more.any()):
             break
-        count += more
+        count = count + more
         term *= rate
         term /= k
         below += term
@@ -68,7 +69,7 @@ def _dim_counts(rate: Tensor, uniform: Tensor) -> Tensor:
     """Return Poisson counts where ``rate`` is below ``GAUSSIAN_FROM``, zero elsewhere."""
     wide = widest(rate.device)  # float32 sums change the count of one pixel in 3e5, so devices would disagree
     dim = rate < GAUSSIAN_FROM
-    if _recording(rate):
+    if _unread(rate):
         every = poisson_quantile(torch.where(dim, rate, 0).to(wide), uniform.to(wide))
         return torch.where(dim, every, 0).to(rate.dtype)
     count = torch.zeros_like(rate)
@@ -84,9 +85,9 @@ _dim_counts_operator = torch.library.custom_op(
 _dim_counts_operator.register_fake(lambda rate, _uniform: torch.empty_like(rate))
 
 
-def _recording(tensor: Tensor) -> bool:
-    """Return whether a CUDA graph is being recorded, during which values cannot be read back."""
-    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+def _unread(tensor: Tensor) -> bool:
+    """Return whether values cannot be read back: while a CUDA graph is recorded, and under ``torch.vmap``."""
+    return Mode.GRAPH in torch_mode() or (tensor.is_cuda and torch.cuda.is_current_stream_capturing())
 
 
 def _normal_quantile(uniform: Tensor) -> Tensor:

@@ -43,8 +43,8 @@ def check_defocus_range(
         window: side of the PSFs in pixels if it is fixed.
 
     Raises:
-        ValueError: if there are more than 4096 layers, or a disc is wider than 10 of the largest windows (at least of
-            65 px).
+        ValueError: if the range does not ascend, there are more than 4096 layers, or a disc is wider than 10 of the
+            largest windows (at least of 65 px).
 
     Example:
         >>> check_defocus_range((-20.0, 20.0), 2.1e-7, Fidelity(), None)
@@ -55,6 +55,8 @@ most 4096 and 650 px are allowed: give lengths in metres, choose a smaller apert
 Fidelity.max_window or layer_spacing
     """
     lo, hi = defocus_range
+    if not lo < hi:  # True for NaN
+        raise ValueError(f"defocus_range must be (lo, hi) with lo < hi, got {(lo, hi)}")
     size = float(step.detach()) if isinstance(step, Tensor) else step
     blur, layers = 2 * max(-lo, hi) * REFERENCE_WAVELENGTH / (math.pi * size), (hi - lo) / fidelity.layer_spacing
     widest = WIDEST_BLUR * max(window or 0, fidelity.max_window, USUAL_WINDOW)

@@ -692,7 +692,7 @@ class PSFModel:
     def window(self) -> int:
         """Side of the PSFs in pixels: fixed by the fidelity, or measured when the model was made."""
         if self._derived.window is None and self.measured is None and self.fixed_window is not None:
-            self._check_layers()
+            self.check_layers()
             return self.fixed_window
         return self.fitted.side
 
@@ -712,7 +712,7 @@ class PSFModel:
             return FittedWindow(self.measured.window, (float(energy.min()), float(energy.max())))
         if (blur := self.wide_blur) is not None:
             return FittedWindow(blur.window, self._wide_light())
-        self._check_layers()
+        self.check_layers()
         found = fitted_window(self._sampled_psfs, self.fidelity, self.fixed_window)
         if not found.enough and (disc := self._disc_window()) is not None:
             found = fitted_window(self._sampled_psfs, self.fidelity, disc)
@@ -746,8 +746,10 @@ class PSFModel:
         psfs = self._exact_psfs(self._sampled.flat(), 1, *states, nodes, size, tolerance=_SAMPLING).psfs
         return psfs if self.fidelity.propagation == "paper" else psfs / self.pupil.field_share
 
-    def _check_layers(self) -> None:
-        check_defocus_range(self.camera.defocus_range, self.pixel_step, self.fidelity, self.fixed_window)
+    def check_layers(self) -> None:
+        """Raise ``ValueError`` for a range of defocus that needs too many layers, or too wide PSFs, unless measured."""
+        if self.measured is None and self.wide_blur is None:
+            check_defocus_range(self.camera.defocus_range, self.pixel_step, self.fidelity, self.fixed_window)
 
     @property
     def pupil(self) -> Pupil:

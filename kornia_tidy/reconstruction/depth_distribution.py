@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
-from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
+from kornia_tidy.kernels.precision import safe_sqrt
+from kornia_tidy.reconstruction.validity import valid_maps
 
 ERROR_WEIGHT = 10.0  # of the ranked probability score: both terms are then of order one
 _COLDEST, _HOTTEST = 1 / 32, 32.0  # limits of a fitted temperature

@@ -9,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
+from kornia_tidy.kernels.precision import safe_sqrt
+from kornia_tidy.reconstruction.validity import valid_maps
 
 PHASECAM3D_WEIGHT = 20.0  # of the RMSE, relative to the gradient loss
 

@@ -15,7 +15,8 @@ import kornia
 import torch
 from torch import Tensor
 
-from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
+from kornia_tidy.kernels.precision import safe_sqrt
+from kornia_tidy.reconstruction.validity import valid_maps
 
 SSIM_WINDOW = 11  # pixels; its weights are a Gaussian of sigma 1.5, as in Wang et al. 2004
 PHASECAM3D_SPAN = 20.0  # radians; PhaseCam3D's maps span psi in [-10, 10], and its RMSE is in radians
@@ -67,7 +68,8 @@ def psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
     """
     prediction, target, mask = valid_maps(prediction, target, mask)
     images = zip(prediction, target, mask, strict=True)
-    return torch.stack([kornia.metrics.psnr(image[seen], truth[seen], max_value) for image, truth, seen in images])
+    found = [kornia.metrics.psnr(image[seen], truth[seen], max_value) for image, truth, seen in images]
+    return torch.stack(found) if found else target.new_empty(0)
 
 
 def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_value: float = 1.0) -> Tensor:

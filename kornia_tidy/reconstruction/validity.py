@@ -53,15 +53,3 @@ def valid_maps(
         raise ValueError(f"mask must broadcast to the target's shape {tuple(target.shape)}, got {tuple(mask.shape)}")
     mask = mask.expand(target.shape)
     return torch.where(mask, prediction, filler), torch.where(mask, target, filler), mask
-
-
-def safe_sqrt(value: Tensor) -> Tensor:
-    """Return the square root, with a gradient of zero instead of infinity at zero.
-
-    Example:
-        >>> x = torch.tensor([0.0, 4.0], requires_grad=True)
-        >>> torch.autograd.grad(safe_sqrt(x).sum(), x)[0]
-        tensor([0.0000, 0.2500])
-    """
-    zero = value == 0
-    return torch.where(zero, 0, torch.where(zero, 1, value).sqrt())

@@ -19,6 +19,7 @@ from kornia_tidy.checks import (
     check_part,
     check_positive,
 )
+from kornia_tidy.kernels.precision import safe_sqrt
 from kornia_tidy.kernels.sensor_ops import record
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import NONSENSE_CODE, check_image, warn_once
@@ -26,6 +27,7 @@ from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
 from kornia_tidy.sensor.steps import check_bits
 
 STRIP = 64  # rows of noise drawn in one call
+MOST_ELECTRONS = 1e30  # of a full well, and the least is its inverse: beyond, float32 has no ratios of electrons
 
 
 class Sensor(nn.Module):
@@ -232,6 +234,9 @@ class SensorNoise(Sensor):
         check_not_negative("dark", dark, "electrons")
         if full_well is not None:
             check_positive("full_well", full_well, "electrons")
+            if not 1 / MOST_ELECTRONS <= full_well <= MOST_ELECTRONS:
+                allowed = f"between {1 / MOST_ELECTRONS:g} and {MOST_ELECTRONS:g}"
+                raise ValueError(f"full_well must be electrons {allowed}, got {full_well}")
             if dark >= full_well:
                 raise ValueError(f"dark must be below full_well, {full_well} electrons, got {dark}")
         elif dark:
@@ -319,7 +324,7 @@ class SensorNoise(Sensor):
             variance = variance + (image.clamp(min=0) + self.dark / self.full_well) / self.full_well
         if self.bits is not None:
             variance = variance + (2**self.bits - 1) ** -2.0 / 12
-        return variance.sqrt()
+        return safe_sqrt(variance)
 
     def extra_repr(self) -> str:
         """Return a one-line description of the sensor."""

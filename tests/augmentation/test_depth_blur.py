@@ -89,6 +89,20 @@ class TestDepthBlur(BaseTester):
         gathered = depth_blur(image, torch.full_like(depth, 0.9), 0.6, 2.0, **LENS)
         self.assert_close(blurred, gathered, atol=1e-4)  # one layer looks alike
 
+    @pytest.mark.filterwarnings("ignore:There is a performance drop:UserWarning")
+    def test_feature_vmap_is_a_loop(self):
+        image, depth = scene(2)
+        found = torch.vmap(lambda i, d: depth_blur(i[None], d[None], 0.6, 2.0, **LENS))(image, depth)
+        self.assert_close(found[:, 0], depth_blur(image, depth, 0.6, 2.0, **LENS), atol=1e-5)
+
+    @pytest.mark.parametrize("near", [1e-45, 1e-30, 1e-18])
+    def test_feature_gradients_are_finite_at_any_depth(self, near):
+        image, depth = scene(1)
+        depth[..., :3], focus = near, torch.tensor(0.6, requires_grad=True)
+        blurred = depth_blur(image, depth.requires_grad_(), focus, 2.0, **LENS)
+        for slope in torch.autograd.grad(blurred.sum(), (depth, focus)):
+            assert slope.isfinite().all()
+
     def test_exception(self):
         image, depth = scene(1)
         with pytest.raises(ValueError, match=r"focus_distance must be beyond the focal length 0.05 m, got 0.04"):

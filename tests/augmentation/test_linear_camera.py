@@ -39,6 +39,22 @@ class TestLinearCamera(BaseTester):
         size = (operator(x.abs()).double().abs() * y.abs().double()).sum()
         assert (left - right).abs() < 2 * gamma(9 * 9 * 5, kind) * size
 
+    @pytest.mark.filterwarnings(
+        "ignore:There is a performance drop:UserWarning", "ignore:.torch.jit:DeprecationWarning"
+    )
+    @pytest.mark.parametrize("lens", [None, "single-50mm"])
+    def test_feature_transforms_of_torch_func(self, lens):
+        """The derivative of A along x is A x, and that of the square of A x is twice its transpose."""
+        image, depth = (part.double() for part in scene(2))
+        operator = LinearCamera(linear(masks=PixelwiseMask(1), lens=lens), depth[:1])
+        for function, back in ((operator, operator.adjoint), (operator.adjoint, operator)):
+            expected = function(image).detach()
+            self.assert_close(torch.func.jvp(function, (1 - image,), (image,))[1], expected, atol=1e-9)
+            each = torch.vmap(lambda one, f=function: f(one[None])[0])(image)
+            self.assert_close(each, expected, atol=1e-9)
+            slope = torch.func.grad(lambda x, f=function: f(x).square().sum())(image)
+            self.assert_close(slope, 2 * back(expected).detach(), atol=1e-9)
+
     def test_feature_each_image_has_its_place_behind_a_lens(self):
         """Of a depth for each image, and of one for all; the transpose too."""
         fidelity = Fidelity(window=9, layer_spacing=20.0)

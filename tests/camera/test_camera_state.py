@@ -15,11 +15,13 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy.camera import camera_of_state
 from kornia_tidy.masks import CubicMask, RadialMask
 from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics import FUSED_SILICA, SYSTEMS
 from kornia_tidy.optics.aperture import circular_aperture
 from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.psf.camera_settings import read_settings, write_settings
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
@@ -260,6 +262,35 @@ class TestAnotherCamera(BaseTester):
             ValueError, match=r"no settings to take over: the state has no entry '_extra_state', only x"
         ):
             small().load_state_dict({"x": torch.ones(1)}, take_over=True)
+
+    @pytest.mark.parametrize(
+        ("part", "name", "value", "sentence"),
+        [
+            ("camera", "focal_length", 0, "focal_length must be positive"),
+            ("camera", "focus_distance", -1.0, "focus_distance must be beyond the focal length"),
+            ("camera", "depth_range", [1.0, 0.5], "depth_range must be"),
+            ("camera", "defocus_range", [1e30, -1e30], "defocus_range must be .* lo < hi"),
+            ("camera", "pixel_pitch", None, "pixel_pitch must be a number"),
+            ("fidelity", "layer_spacing", 1e-9, "layers of PSFs"),
+            ("masks", "constraint", "none of them", "constraint must be one of"),
+            ("masks", "max_phase", math.nan, "max_phase must be positive"),
+            ("modulator", "shares", [-1.0, 2.0], "dwell shares must be"),
+            ("sensor", "full_well", 0, "full_well must be positive"),
+            ("sensor", "bits", 8.5, "bits must be a whole number"),
+        ],
+    )
+    def test_exception_settings_that_no_camera_can_have_change_nothing(self, part, name, value, sentence):
+        optics, fixed = small(modulator=DwellTimes((1, 2))), Fidelity(window=9)
+        before, settings = copy.deepcopy(optics.state_dict()), optics.settings()
+        state = trained(small(modulator=DwellTimes((3, 1)), fidelity=fixed)).state_dict()
+        saved = read_settings(state[EXTRA])
+        saved[part][name] = value
+        damaged = {**state, EXTRA: write_settings(saved)}
+        for load_it in (camera_of_state, lambda state: optics.load_state_dict(state, take_over=True)):
+            with pytest.raises(ValueError, match=sentence):
+                load_it(damaged)
+        assert optics.settings() == settings
+        assert all(torch.equal(optics.state_dict()[key], value) for key, value in before.items())
 
     def test_exception_a_damaged_state_tells_so(self):
         state, flips = small().state_dict(), random.Random(0)

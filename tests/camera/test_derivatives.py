@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
-from torch.func import functional_call, grad, jvp, vmap
+from torch.func import functional_call, grad, jvp, linearize, vmap
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.occlusion_ops import SOURCE
 from kornia_tidy.render.compositing import COMPOSITING
@@ -201,6 +201,23 @@ class TestTransformsOfTorch(BaseTester):
         for slope, *one in zip(found, images, depths, strict=True):
             own = grad(loss)(masks, *one)["masks.phase"]
             self.assert_close(slope, own, rtol=0, atol=1e-10 * float(own.abs().max()))
+
+    def test_feature_vmap_draws_and_replays_noise(self, compositing):
+        optics, (image, depth) = camera(compositing, sensor=SensorNoise(0.01, full_well=60.0)), scene()
+        drawn = optics.draw(image)
+        with torch.no_grad():
+            both = vmap(lambda i: optics(i, depth, params=drawn))(torch.stack([image, image]))
+            self.assert_close(both[1], optics(image, depth, params=drawn), rtol=0, atol=1e-9)
+            one, other = vmap(lambda i: optics(i, depth), randomness="different")(torch.stack([image, image]))
+        assert not torch.equal(one, other)
+
+    @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node:UserWarning")  # masks are its constants
+    def test_feature_linearize_is_the_derivative(self, compositing):
+        optics, (image, depth) = camera(compositing), scene()
+        way = 1 - image
+        with torch.no_grad():
+            found = linearize(lambda i: optics(i, depth), image)[1](way)
+            self.assert_close(found, jvp(lambda i: optics(i, depth), (image,), (way,))[1], rtol=0, atol=1e-11)
 
     def test_feature_nothing_of_a_transform_is_remembered(self, compositing):
         """Cameras, kernels and PSFs that were first used within one serve outside of it, to the last bit."""

@@ -141,6 +141,12 @@ BAD_CALLS: list[tuple[str, tuple[Any, ...], type[Exception], str]] = [
     ),
     ("depth of 3 channels", (IMAGE, DEPTH.expand(-1, 3, -1, -1)), ValueError, r"depth must have shape"),
     ("integer image", ((255 * IMAGE).byte(), DEPTH), TypeError, r"image must be floating point .* got torch.uint8"),
+    (
+        "sparse image",
+        (IMAGE.to_sparse(), DEPTH),
+        TypeError,
+        "must be a dense tensor, got a torch.sparse_coo one",
+    ),
     ("integer depth", (IMAGE, DEPTH.long()), TypeError, r"depth must be floating point .* got torch.int64"),
     ("an array", (IMAGE.numpy(), DEPTH), TypeError, r"image must be a torch.Tensor, got ndarray"),
     ("NaN image", (spoilt(IMAGE, torch.nan), DEPTH), ValueError, r"image must be finite, got nan"),

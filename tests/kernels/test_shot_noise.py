@@ -133,5 +133,5 @@ class TestShotNoise(BaseTester):
         rate = 50 * torch.rand(2, 3, 16, 16, device=device, dtype=dtype)
         uniform = torch.rand_like(rate)
         waiting = shot_noise(rate, uniform)
-        monkeypatch.setattr(shot, "_recording", lambda _: True)
+        monkeypatch.setattr(shot, "_unread", lambda _: True)
         assert torch.equal(shot_noise(rate, uniform), waiting)

@@ -87,6 +87,10 @@ class TestMetrics(BaseTester):
         assert value.isnan().tolist() == [False, True, False]
         assert torch.equal(value[::2], whole[::2])
 
+    def test_feature_no_image_has_no_score(self, metric, device):
+        none = torch.ones(0, 1, 24, 27, device=device)
+        assert metric(none, none).shape == (0,)
+
     def test_feature_a_nan_that_is_seen_is_not_hidden(self, metric, device):
         prediction, target, mask = make_depths(device=device)
         prediction[0, 0, 20, 20] = torch.nan

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.reconstruction.validity import safe_sqrt, valid_maps
+from kornia_tidy.kernels.precision import safe_sqrt
+from kornia_tidy.reconstruction.validity import valid_maps
 from tests.base import BaseTester
 
 

@@ -46,3 +46,5 @@ def test_feature_std_is_that_of_drawn_noise(sensor):
 def test_feature_std_of_negative_light_is_that_of_darkness():
     sensor = SensorNoise(0.01, full_well=100.0)
     assert torch.equal(sensor.std(torch.tensor([-1.0])), sensor.std(torch.tensor([0.0])))
+    dark = torch.zeros(1, requires_grad=True)
+    assert torch.autograd.grad(SensorNoise(0.0, full_well=100.0).std(dark), dark)[0] == 0

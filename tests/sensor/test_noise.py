@@ -62,6 +62,7 @@ class TestSensorNoise(BaseTester):
             ({"sigma": float("nan")}, "sigma must be zero or positive and finite, in units of full scale, got nan"),
             ({"full_well": 0.0}, "full_well must be positive and finite electrons, got 0.0"),
             ({"full_well": -5.0}, "full_well must be positive and finite electrons, got -5.0"),
+            ({"full_well": 1e31}, r"full_well must be electrons between 1e-30 and 1e\+30, got 1e\+31"),
             ({"bits": 0}, "bits must be a whole number from 1 to 16, got 0"),
             ({"bits": 17}, "bits must be a whole number from 1 to 16, got 17"),
             ({"dark": 3.0}, "dark needs full_well, .* got dark = 3.0 alone"),
