@@ -65,7 +65,7 @@ class TestSensorNoise(BaseTester):
             ({"full_well": 1e31}, r"full_well must be electrons between 1e-30 and 1e\+30, got 1e\+31"),
             ({"bits": 0}, "bits must be a whole number from 1 to 16, got 0"),
             ({"bits": 17}, "bits must be a whole number from 1 to 16, got 17"),
-            ({"dark": 3.0}, "dark needs full_well, .* got dark = 3.0 alone"),
+            ({"dark": 3.0}, "dark needs full_well, .* got dark = 3.0 without it"),
             ({"dark": -3.0, "full_well": 9.0}, "dark must be zero or positive and finite, electrons, got -3.0"),
             ({"dark": 9.0, "full_well": 9.0}, "dark must be below full_well, 9.0 electrons, got 9.0"),
         ],
