@@ -11,6 +11,7 @@ from typing import Any, NoReturn, Self
 import torch
 from torch import Tensor, nn
 
+from kornia_tidy.camera.saved_parts import check_parts
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.fidelity import PRESETS, Fidelity
 from kornia_tidy.masks.base import PhaseMasks
@@ -303,8 +304,6 @@ class CameraState(nn.Module):
                     f"there are no settings to take over: the state has no entry {EXTRA_STATE!r}, only "
                     f"{', '.join(state_dict) or 'nothing'}"
                 )
-            from kornia_tidy.camera.saved_camera import check_parts  # noqa: PLC0415 (it makes cameras)
-
             check_parts(state_dict, self.settings())
             saved, rehearsal = read_settings(state_dict[EXTRA_STATE]), copy.deepcopy(self)
             for camera in (rehearsal, self):  # so that an error changes nothing

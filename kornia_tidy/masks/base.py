@@ -102,7 +102,7 @@ class PhaseMasks(nn.Module):
     def arguments_of(cls, parameters: Mapping[str, Tensor]) -> dict[str, Any]:
         """Return the arguments of the class that follow from the shapes of a state's parameters, such as ``num_masks``.
 
-        Pixels, material and limits are no parameters; see :func:`~kornia_tidy.camera.saved_camera.masks_of_state`.
+        Pixels, material and limits are no parameters; see :func:`~kornia_tidy.camera.saved_parts.masks_of_state`.
 
         Args:
             parameters: of a ``state_dict`` of these masks.

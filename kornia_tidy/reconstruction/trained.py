@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.camera.saved_camera import below, camera_of_state, masks_of_state
+from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy.camera.saved_parts import below, masks_of_state
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity

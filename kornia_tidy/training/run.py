@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from kornia_tidy.camera.saved_camera import below
+from kornia_tidy.camera.saved_parts import below
 from kornia_tidy.files import only_here
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank

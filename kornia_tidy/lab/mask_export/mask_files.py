@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from kornia_tidy.camera.saved_camera import masks_of_state, modulator_of_state
+from kornia_tidy.camera.saved_parts import masks_of_state, modulator_of_state
 from kornia_tidy.checks import check_choice
 from kornia_tidy.data.npy import decode_npy
 from kornia_tidy.files import read_bytes, write_bytes
