@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.tiff_directories import DESCRIPTION, PHOTOMETRIC, Directory, picture_directories
-from kornia_tidy.data.tiff_segments import Layout, decode_segments, layout_of, named
+from kornia_tidy.data.tiff_segments import JPEG, Layout, decode_segments, layout_of, named
 
 ORIENTATION, COLOUR_MAP, EXTRA_SAMPLES, GDAL_METADATA, GDAL_NODATA = 274, 320, 338, 42112, 42113
 
-_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE = range(4)
-_COLOURS = {_WHITE_IS_ZERO: 1, _BLACK_IS_ZERO: 1, _RGB: 3, _PALETTE: 1}  # samples without extra ones
+_WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
+_COLOURS = {_WHITE_IS_ZERO: 1, _BLACK_IS_ZERO: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}  # samples without extra ones
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # kinds of alpha: colours are multiplied by the first
 _UNSIGNED, _SIGNED, _FLOAT = 1, 2, 3  # SampleFormat
 _SCALE = re.compile(rb'<Item [^<>]{0,200}role="(scale|offset)"[^<>]{0,200}>([^<>]{1,40})</Item>')
@@ -40,7 +40,7 @@ def decode_tiff(
 
     Returns:
         values: (H, W, C) in the stored rows and columns, without alpha and other extra samples. WhiteIsZero is
-            inverted, and palette indices are replaced by colours.
+            inverted, palette indices are replaced by colours, and JPEG's YCbCr is converted to RGB.
         white: the number that means 1 in a picture of integers.
         unknown: (H, W), True where the file says that nothing was measured: by GDAL's missing value, by a mask, by
             transparency or by a strip or tile that is left out. None if it says so nowhere.
@@ -91,8 +91,12 @@ def _photometric(directory: Directory, layout: Layout) -> int:
     if photometric not in _COLOURS:
         name = f"photometric interpretation {photometric}, {named('PHOTOMETRIC', photometric)}"
         raise ValueError(f"the meaning of its pixels is not read ({name})")
-    if photometric == _PALETTE and (layout.format != _UNSIGNED or layout.bits > 16):
-        raise ValueError(f"its pixels are indices of a palette, of {layout.bits} bits, which is not read")
+    if photometric == _YCBCR and (layout.compression, layout.planes, layout.samples) != (JPEG, 1, 3):
+        raise ValueError(
+            "its pixels are YCbCr (photometric interpretation 6), which is read with JPEG in one plane only"
+        )
+    if photometric == _PALETTE and (layout.compression == JPEG or layout.format != _UNSIGNED or layout.bits > 16):
+        raise ValueError(f"its pixels are indices of a palette, of {layout.bits} bits or with JPEG, which is not read")
     if _COLOURS[photometric] > layout.samples:
         raise ValueError(f"the file is damaged: it is RGB with {layout.samples} samples a pixel")
     return photometric

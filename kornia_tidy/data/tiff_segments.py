@@ -18,18 +18,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_tidy.data.picture_header import check_pixels
+from kornia_tidy.data.picture_header import check_pixels, jpeg_frame
 from kornia_tidy.data.tiff_directories import COLUMNS, COMPRESSION, PHOTOMETRIC, ROWS, SAMPLES, Directory
 from kornia_tidy.search_path import import_installed
 
-BITS, FILL_ORDER, STRIP_OFFSETS, ROWS_PER_STRIP, STRIP_BYTES, PLANES = 258, 266, 273, 278, 279, 284
+BITS, FILL_ORDER, STRIP_OFFSETS, ROWS_PER_STRIP, STRIP_BYTES, PLANES, T4_OPTIONS = 258, 266, 273, 278, 279, 284, 292
 PREDICTOR, TILE_COLUMNS, TILE_ROWS, TILE_OFFSETS, TILE_BYTES, SAMPLE_FORMAT = 317, 322, 323, 324, 325, 339
-DEPTH, TILE_DEPTH = 32997, 32998
+JPEG_TABLES, DEPTH, TILE_DEPTH = 347, 32997, 32998
 
 MOST_SAMPLES = 4
 MOST_SEGMENTS = 1 << 18
-UNFOLDS = {1: 1, 5: 1 << 12, 8: 1 << 11, 32773: 64, 32946: 1 << 11, 34925: 1 << 14, 50000: 1 << 16}
+JPEG, CCITT = 7, (2, 3, 4)
+UNFOLDS = {1: 1, 2: 1 << 16, 3: 1 << 16, 4: 1 << 16, 5: 1 << 12, 7: 1 << 11, 8: 1 << 11, 32773: 64, 32946: 1 << 11,
+           34925: 1 << 14, 50000: 1 << 16}  # fmt: skip
 """Compressions that are read, and the most bytes that one byte can unfold to."""
+_RGB, _YCBCR = 2, 6  # photometric interpretations
+_JPEG_PROCESSES = (0, 1, 2)  # baseline, extended, progressive
 _PREDICTED = (5, 8, 32946, 34925, 50000)  # compressions that may come with a predictor
 _FORMATS = {1: "unsigned integers", 2: "signed integers", 3: "floating-point numbers", 4: "values of undefined meaning",
             5: "complex integers", 6: "complex numbers"}  # fmt: skip
@@ -127,8 +131,9 @@ def decode_segments(
             missing[area] = True
             continue
         coded, title = data[offset : offset + size], f"{name} {number + 1} of {len(places)}"
+        rows = high if layout.compression != JPEG else _jpeg_rows(coded, high, layout, title)
         try:
-            segment = decode(coded, high)[:high]
+            segment = decode(coded, rows)[:high]
             if segment.dtype != dtype:
                 raise ValueError(f"it holds {segment.dtype}")
         except MemoryError:
@@ -166,7 +171,10 @@ def _compression(directory: Directory, bits: int, kind: int) -> int:
         except KeyError:
             said = f"its compression is {compression}: that needs newer packages (pip install -U tifffile imagecodecs)"
             raise ValueError(said) from None
-    if predictor != 1:
+    if (compression in CCITT and (bits, kind) != (1, 1)) or (compression == JPEG and (bits, kind) != (8, 1)):
+        what = f"{bits}-bit {_FORMATS[kind]}"
+        raise ValueError(f"its compression is {compression} with {what}: JPEG is read of 8 bits, CCITT of 1 bit")
+    if predictor != 1 and compression not in {JPEG, *CCITT}:
         if compression not in _PREDICTED:
             raise ValueError(f"its predictor is {predictor} with compression {compression}, which has none")
         if predictor not in {2, 3} or bits not in {8, 16, 32, 64} or (predictor == 3 and kind != 3):
@@ -226,12 +234,13 @@ def _extents(
 
 def _decoder(directory: Directory, layout: Layout, data: bytes) -> Callable[[bytes, int], NDArray[Any]]:
     """Return what decodes the bytes of a strip or tile with some rows to (rows, columns, samples)."""
+    tables = directory.numbers(JPEG_TABLES).astype(np.uint8).tobytes() or None
     decoders: dict[int, Callable[..., Any]] = {}
 
     def decode_rows(segment: bytes, rows: int) -> NDArray[Any]:
         if rows not in decoders:
-            decoders[rows] = _tifffile_decoder(directory, layout, rows)
-        decoded = decoders[rows](segment, 0)[0][0]
+            decoders[rows] = _tifffile_decoder(directory, layout, rows, segment)
+        decoded = decoders[rows](segment, 0, jpegtables=tables)[0][0]
         return decoded.view(np.uint8) if decoded.dtype == bool else decoded
 
     def decode(segment: bytes, rows: int) -> NDArray[Any]:
@@ -243,6 +252,23 @@ def _decoder(directory: Directory, layout: Layout, data: bytes) -> Callable[[byt
             return decode_rows(segment, layout.segment[0])  # some programs fill up the last strip
 
     return decode
+
+
+def _jpeg_rows(coded: bytes, high: int, layout: Layout, title: str) -> int:
+    """Return the rows of a JPEG that is a strip or tile: as many as the strip shows, or as others have.
+
+    Raises:
+        ValueError: if it is of another size or kind.
+    """
+    try:
+        frame = jpeg_frame(coded)
+    except ValueError:
+        raise ValueError(f"the file is cut short or damaged: {title} is no whole JPEG") from None
+    if frame.process not in _JPEG_PROCESSES or frame.bits != layout.bits:
+        raise ValueError(f"its JPEG is of process {frame.process} and {frame.bits} bits: 0, 1 or 2 and 8 bits are read")
+    if frame.columns != layout.segment[1] or frame.rows not in {high, layout.segment[0]}:
+        raise ValueError(f"the file is damaged: {title} is a JPEG of {frame.rows} x {frame.columns} pixels")
+    return frame.rows
 
 
 def named(kind: str, value: int) -> str:
@@ -258,15 +284,20 @@ def _tifffile() -> Any:
     return import_installed("tifffile")
 
 
-def _tifffile_decoder(directory: Directory, layout: Layout, rows: int) -> Callable[..., Any]:
+def _tifffile_decoder(directory: Directory, layout: Layout, rows: int, first: bytes) -> Callable[..., Any]:
     """Return tifffile's decoder of strips or tiles with some rows."""
     tifffile = _tifffile()
 
     samples = layout.samples if layout.planes == 1 else 1
+    # JPEG's colours are converted if they are called YCbCr, or called RGB with a JFIF header, which says otherwise.
+    given = directory.number(PHOTOMETRIC, _RGB)
+    photometric = given if given == _YCBCR else _RGB
+    head = first[:16] if given == _RGB else b""
     fields = {
         COLUMNS: [layout.segment[1]], ROWS: [rows], BITS: [layout.bits] * samples, COMPRESSION: [layout.compression],
-        PHOTOMETRIC: [1], FILL_ORDER: [directory.number(FILL_ORDER, 1)], STRIP_OFFSETS: [0], SAMPLES: [samples],
-        ROWS_PER_STRIP: [rows], STRIP_BYTES: [0], PLANES: [1],
+        PHOTOMETRIC: [photometric if layout.compression == JPEG and samples == 3 else 1],
+        FILL_ORDER: [directory.number(FILL_ORDER, 1)], STRIP_OFFSETS: [0], SAMPLES: [samples], ROWS_PER_STRIP: [rows],
+        STRIP_BYTES: [len(head)], PLANES: [1], T4_OPTIONS: [directory.number(T4_OPTIONS, 0)],
         PREDICTOR: [directory.number(PREDICTOR, 1)] if layout.compression in _PREDICTED else [1],
         SAMPLE_FORMAT: [layout.format] * samples,
     }  # fmt: skip
@@ -280,4 +311,4 @@ def _tifffile_decoder(directory: Directory, layout: Layout, rows: int) -> Callab
         entries += packed if len(numbers) == 1 else struct.pack(f"{order}I", values + len(behind))
         behind += packed
     start = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(fields))
-    return tifffile.TiffFile(io.BytesIO(start + entries + bytes(4) + behind)).pages.first.decode
+    return tifffile.TiffFile(io.BytesIO(start + entries + bytes(4) + behind + head)).pages.first.decode

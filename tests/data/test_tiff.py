@@ -40,6 +40,10 @@ def by_opencv(data: bytes) -> np.ndarray:
     return found[..., None] if found.ndim == 2 else found[..., ::-1]
 
 
+def jpeg(picture: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", picture)[1].tobytes()
+
+
 def walked(count: int, seed: int, folder) -> Counter[str]:
     """Read combinations of properties; return how many were read and refused."""
     counts: Counter[str] = Counter()
@@ -55,7 +59,9 @@ class TestReadsWhatIsStored(BaseTester):
         counts = walked(150, 0, tmp_path)
         assert min(counts["read"], counts["refused"]) > 50
 
-    @pytest.mark.parametrize("compression", ["raw", "tiff_lzw", "tiff_adobe_deflate", "tiff_deflate", "packbits"])
+    @pytest.mark.parametrize(
+        "compression", ["raw", "tiff_lzw", "tiff_adobe_deflate", "tiff_deflate", "packbits", "jpeg"]
+    )
     @pytest.mark.parametrize("picture", [RGB, GREY[..., 0]])
     def test_feature_equals_libtiff_bit_for_bit(self, compression, picture):
         """Written and decoded by two other programs' libtiff, Pillow's and OpenCV's."""
@@ -64,18 +70,19 @@ class TestReadsWhatIsStored(BaseTester):
 
     @pytest.mark.parametrize(
         "options",
-        ["-c lzw:2 -p separate", "-c zip:2 -B", "-c zstd:2 -8 -r 7",
+        ["-c jpeg:90", "-c jpeg:r -t -w 32 -l 16", "-c lzw:2 -p separate", "-c zip:2 -B", "-c zstd:2 -8 -r 7",
          "-c lzma:2 -t -w 16 -l 32", "-f lsb2msb -c packbits -B -8"],
     )  # fmt: skip
     def test_feature_what_libtiff_writes(self, options, tmp_path):
-        """Every way of storing one picture gives the same numbers."""
+        """Every way of storing one picture gives the same numbers; those of JPEG equal OpenCV's."""
         if shutil.which("tiffcp") is None:
             pytest.skip("tiffcp of libtiff is not on this machine")
         (tmp_path / "a.tif").write_bytes(by_pillow(RGB))
         command = ["tiffcp", *options.split(), str(tmp_path / "a.tif"), str(tmp_path / "b.tif")]
         if subprocess.run(command, capture_output=True, check=False).returncode:
             pytest.skip(f"this tiffcp does not write {options}")
-        assert np.array_equal(decoded((tmp_path / "b.tif").read_bytes()).values, RGB)
+        data = (tmp_path / "b.tif").read_bytes()
+        assert np.array_equal(decoded(data).values, by_opencv(data) if "jpeg" in options else RGB)
 
     def test_feature_lzw_of_before_1992(self):
         """With the bits of codes the other way round."""
@@ -163,11 +170,11 @@ class TestRefused(BaseTester):
                 {"photometric": 1, "fields": {338: (3, [2] * 999)}},
                 "3 samples a pixel .* and ExtraSamples 2, 2, 2: save",
             ),
-            ({"compression": 7}, r"its compression is 7 \(JPEG\), not read"),
             ({"compression": 34712}, r"its compression is 34712 \(JPEG2000\), not read"),
             ({"fields": {262: (3, [5])}}, r"pixels is not read \(photometric interpretation 5, SEPARATED\)"),
-            ({"fields": {262: (3, [6])}}, r"its pixels is not read \(photometric interpretation 6, YCBCR\)"),
+            ({"fields": {262: (3, [6])}}, r"its pixels are YCbCr \(photometric interpretation 6\)"),
             ({"bits": 4, "format": 2}, r"its samples are 4-bit signed integers \(SampleFormat 2\), which are not read"),
+            ({"bits": 16, "compression": 7}, "its compression is 7 with 16-bit unsigned integers"),
             ({"fields": {254: (4, [1])}}, r"only a reduced-resolution preview \(NewSubfileType 1\).* raw develop"),
             ({"fields": {254: (4, [4])}}, r"only a transparency mask \(NewSubfileType 4\)"),
         ],
@@ -196,6 +203,8 @@ class TestRefused(BaseTester):
             ({"fields": {277: (3, [1])}}, "damaged: it is RGB with 1 samples a pixel"),
             ({"compression": 8, "segments": [b"\x78\x9c" + bytes(500)]}, r"damaged: strip 1 of 1 \("),
             ({"compression": 5, "segments": [lzw(bytes(99)) + bytes(60)]}, r"damaged: strip 1 of 1 \("),
+            ({"compression": 7, "segments": [jpeg(RGB[:32])]}, "damaged: strip 1 of 1 is a JPEG of 32 x 60 pixels"),
+            ({"compression": 7, "segments": [jpeg(RGB)[:-40]]}, "cut short or damaged: strip 1 of 1 is no whole"),
             ({"rows_per_strip": 20, "fields": {273: (4, [8, 8]), 279: (4, [5000] * 2)}, "compression": 8,
               "segments": [bytes(4000)] * 2},
              "damaged: its strips lie over each other"),

@@ -11,6 +11,7 @@ import cv2
 import h5py
 import numpy as np
 import torch
+from PIL import Image
 
 from kornia_tidy import PSFBank, TiDyOptics
 from kornia_tidy.data import DeadLeaves, NYUDepthV2, TUMSequence, described_folder, read_depth, read_image
@@ -109,7 +110,12 @@ def _pictures(folder: Path) -> list[Case]:
 def _tiffs(folder: Path) -> list[Case]:
     """TIFF files with many combinations of properties, as a picture and as depth."""
     folder.mkdir()
+    rows = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
     cases = []
+    for name, picture in (("jpeg", rows), ("group3", rows[..., 0] > 99), ("group4", rows[..., 0] > 99)):
+        path = folder / f"{name}.tif"
+        Image.fromarray(picture).save(path, compression=name)
+        cases.append(Case("tiff", "tiff", path, read_image))
     for number, made in enumerate(combinations(TIFFS, 0)):
         path = folder / f"{number:03d}.tif"
         path.write_bytes(make_tiff(made, np.random.default_rng(number))[0])
