@@ -6,10 +6,11 @@ import math
 
 import pytest
 import torch
+from kornia.filters import gaussian_blur2d
 
 from kornia_tidy import PSFBank, SensorNoise
 from kornia_tidy.data import PHOTOGRAPHS
-from kornia_tidy.reconstruction import ClosedFormHead, RuledClosedForm, reconstruct_tiled
+from kornia_tidy.reconstruction import ClosedFormHead, RuledClosedForm, reconstruct_tiled, ruled_closed_form
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
@@ -162,6 +163,26 @@ class TestRuledClosedForm(BaseTester):
         restore, capture = ruled(points()), photo(40, 40)
         self.assert_close(restore(capture, 1e-4).image, capture, atol=1e-4, rtol=0)
 
+    def test_feature_soft_scenes_are_restored_as_soft(self, monkeypatch):
+        """A scene with a hundredth of the fine detail of photographs: not as one with three times as much."""
+        generator = torch.Generator().manual_seed(0)
+        scene = gaussian_blur2d(
+            torch.rand(1, 3, 96, 96, generator=generator, dtype=torch.float64), (41, 41), (8.0, 8.0)
+        )
+        scene = 0.5 + 0.02 * (scene - scene.mean()) / scene.std()
+        restore = ruled(encoded=False)
+        seen = convolve_kernels(scene, restore.psfs.mean(0)[None])[:, 0]
+        seen = seen + 0.003 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
+
+        def error():
+            return float((restore(seen, 0.003).image - scene).square().mean())
+
+        soft = error()
+        monkeypatch.setattr(ruled_closed_form, "CONTENT", (0.03, 4.0))
+        assert float(restore.settings_of(seen, 0.003).detail) < 0.03
+        assert soft < 0.9 * error()
+
+    @pytest.mark.filterwarnings("ignore:sigma is 2.4 times full scale")
     @pytest.mark.parametrize("electrons", [1.0, 20.0])
     def test_feature_next_to_no_light_leaves_next_to_no_noise(self, electrons):
         sensor = SensorNoise(2.4 / electrons, full_well=electrons)
