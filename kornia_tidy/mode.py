@@ -65,7 +65,9 @@ def torch_mode() -> Mode:
         tensor([1., 1.])
     """
     functorch = torch._C._functorch
-    unknown = torch.compiler.is_compiling() or torch.jit.is_tracing() or _is_recorded()
+    unknown = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    # make_fx records, as in torch.func.linearize.
+    unknown = unknown or torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is not None
     # While compiling, the empty stack is a proxy of None, so a comparison with None would fail.
     nested = isinstance(functorch.peek_interpreter_stack(), functorch.CInterpreter)
     if nested and not unknown:
@@ -73,11 +75,6 @@ def torch_mode() -> Mode:
     if nested or forward_ad._current_level >= 0:
         return Mode.TRACED if unknown else Mode.TRANSFORM
     return Mode.GRAPH if unknown else _thread.mode
-
-
-def _is_recorded() -> bool:
-    """Return whether operations are recorded as a graph by ``make_fx``, as ``torch.func.linearize`` does."""
-    return torch._C._get_dispatch_mode(torch._C._TorchDispatchModeKey.PROXY) is not None
 
 
 @contextmanager

@@ -190,7 +190,8 @@ def read_sample(
         model.spectrum_of(image.shape[1], layout_remedy(given, channels))  # raises
     if 0 in image.shape[-2:]:
         raise ValueError(f"image must hold at least one pixel, got shape {tuple(image.shape)}")
-    check_depth_fits(depth, image)
+    if depth.shape[1:] != (1, *image.shape[-2:]) or len(depth) not in (1, len(image)):
+        check_depth_fits(depth, image)  # raises
     at_once = image.device.type == "cpu" or not deferred
     if camera.check_inputs and at_once and Mode.GRAPH not in torch_mode() and image.numel():
         lowest, highest = torch.aminmax(image.detach())

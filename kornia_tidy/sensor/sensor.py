@@ -91,7 +91,9 @@ class Sensor(nn.Module):
         """
         check_float_tensor("image", image, 4, "(B, C, H, W)")
         if not torch_mode() & (Mode.GRAPH | Mode.UNREAD):
-            _check_light(image, getattr(self, "clip", False))
+            mean = float(image.detach().mean()) if image.numel() else 0.0  # one pass, NaN if any value is
+            if not 0 <= mean <= NONSENSE_CODE:
+                _check_light(image, mean, getattr(self, "clip", False))
         light = image.to(torch.promote_types(image.dtype, torch.float32))
         if params is None:
             fields = self.draw(image.shape, image.device, generator, light.dtype)
@@ -141,11 +143,8 @@ class Sensor(nn.Module):
         return fields
 
 
-def _check_light(image: Tensor, clip: bool) -> None:
+def _check_light(image: Tensor, mean: float, clip: bool) -> None:
     """Raise an error for values that are no light, and warn once of a picture that the full well turns white."""
-    mean = float(image.detach().mean()) if image.numel() else 0.0  # one pass, NaN if any value is
-    if 0 <= mean <= NONSENSE_CODE:
-        return
     said = check_image(image, encoded=False)
     if said is None and clip and mean > NONSENSE_CODE:
         said = (

@@ -132,8 +132,16 @@ class _Sums:
         self.size, self.places, self.terms = window_size(scene.psfs.shape[-1]), (), 0
         if scene.field is not None:
             self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
-        elif scene.compositing == "gather" and (terms := _terms(self.psfs)):
-            self.terms = terms * _fits(scene, gather_ops.smallest_output(scene.image.dtype))
+        elif scene.compositing == "gather":
+            count, side, terms = self.psfs.shape[0] * self.psfs.shape[1], self.psfs.shape[-1], 0
+            if side <= LARGEST_DIRECT:
+                terms = side**2
+            # Most pairs of neighbours in the middle of a disc are equal, and in that of other PSFs none is; where work
+            # is counted, one number stands for all samples.
+            elif self.psfs.stride(-1) and 2 * int(self.psfs[..., side // 2].diff().count_nonzero()) <= count * side:
+                terms = -(-count_terms(self.psfs) // count)
+            if terms and (side <= LARGEST_DIRECT or 2 * terms <= side**2):
+                self.terms = terms * _fits(scene, gather_ops.smallest_output(scene.image.dtype))
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         if self.terms:
@@ -148,20 +156,6 @@ class _Sums:
         given = plane, pixels, *self.labels, self.psfs.shape[-4]
         found = overlap_psf_gradient(*given, self.size, correlate=correlate, places=self.places)
         return found.flatten(0, 1) if self.places else found
-
-
-def _terms(psfs: Tensor) -> int:
-    """Return the number of a PSF's terms where it is convolved directly, otherwise 0."""
-    count, side = psfs.shape[0] * psfs.shape[1], psfs.shape[-1]
-    if side <= LARGEST_DIRECT:
-        return side**2
-    if not psfs.stride(-1):  # one number for all samples, of which work is counted
-        return 0
-    # Most pairs of neighbours in the middle of a disc are equal, and in that of other PSFs none is.
-    if 2 * int(psfs[..., side // 2].diff(dim=-1).count_nonzero()) > count * side:
-        return 0
-    terms = -(-count_terms(psfs) // count)
-    return terms if 2 * terms <= side**2 else 0
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
