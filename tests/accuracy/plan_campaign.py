@@ -46,7 +46,6 @@ from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
-from kornia_tidy.render.pieces import Piece
 from kornia_tidy.render.stray_light import spread_evenly
 from tests.accuracy.adversarial_scenes import BORDERS, COMPOSITINGS, SCENES
 from tests.accuracy.planning_rig import Rig, smooth
@@ -156,10 +155,10 @@ def _ray_error(optics: TiDyOptics, light: Tensor, defocus: Tensor, plan: RenderP
     exact = optics.with_fidelity(REFERENCE.replace(window=window))
     nodes = tuple(defocus.double().unique().tolist())
     bank = exact.psf_bank(light.shape[1], torch.float64, nodes if len(nodes) > 1 else (nodes[0], nodes[0] + 1.0))
-    reference = gather_group(light.double(), defocus.double(), Piece(lambda: bank, window=window), optics.border)
+    margin, every = window // 2 if optics.border == "valid" else 0, torch.ones_like(defocus, dtype=torch.bool)
+    reference = gather_group(light.double(), defocus.double(), bank, every, 1, margin, optics.border)
     index = torch.bucketize(defocus.double(), bank.defocus)[:, 0]
     stray = (1 - bank.psfs.sum((2, 3)))[index].movedim(-1, 1) * spread_evenly(light.double(), window, optics.border)
-    margin = window // 2 if optics.border == "valid" else 0
     reference = reference + cropped(stray, margin)
     ours = Rig(optics).capture(light, defocus, plan.fidelity)
     return float((cropped(ours, (ours.shape[-1] - reference.shape[-1]) // 2) - reference).square().mean().sqrt())
