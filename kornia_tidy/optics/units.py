@@ -74,7 +74,7 @@ or give linear light with color_space='linear'
     )
     if encoded and highest > NONSENSE_CODE:
         raise ValueError(beyond)
-    if (worst := max(highest, -lowest)) > LARGEST_LIGHT:
+    if (worst := max(highest, -lowest)) > (1 + 1e-6) * LARGEST_LIGHT:  # float32 rounds it up
         raise ValueError(f"image must be within {LARGEST_LIGHT:g} to be summed in float32, got {worst:g}")
     darkest = DARKEST_CODE if encoded else DARKEST_LIGHT
     return normalised(lowest, highest, darkest) or (beyond if encoded and highest > BRIGHTEST_CODE else None)

@@ -27,7 +27,7 @@ class TestDesignTask(BaseTester):
             ({"mask_size": 5000}, "mask_size must be a whole number from 1 to 1024, got 5000"),
             ({"mask_size": 23.0}, "mask_size must be a whole number from 1 to 1024, got 23.0"),
             ({"full_well": 0}, "full_well must be positive and finite, got 0"),
-            ({"depth_weight": 1.5}, r"depth_weight must be from 0 \(image alone\) to 1 \(depth alone\), got 1.5"),
+            ({"depth_weight": 1.5}, r"depth_weight must be from 0 \(only the image\) to 1 \(only depth\), got 1.5"),
         ],
     )
     def test_exception_names_the_value_and_what_is_allowed(self, given, sentence):

@@ -206,7 +206,7 @@ class TestImage(BaseTester):
         image, depth = scene()
         camera()(1.4 * image - 0.2, depth)
         camera(color_space="linear", sensor=None)(2.7 * image - 0.8, depth)
-        camera(check_inputs=False)(255 * image, depth)
+        camera(check_inputs=False, sensor=None)(255 * image, depth)
 
     @pytest.mark.parametrize(("whole", "scale"), [(torch.uint8, 255), (torch.int32, 65535)])
     def test_exception_whole_numbers_say_how_to_convert(self, whole, scale):

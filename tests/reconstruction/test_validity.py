@@ -58,7 +58,7 @@ class TestValidMaps(BaseTester):
         depth = torch.zeros(1, 1, 2, 2, device=device)
         with pytest.raises(TypeError, match=r"mask must be bool, .* got torch.float32"):
             valid_maps(depth, depth, torch.ones_like(depth))
-        with pytest.raises(TypeError, match=r"target must be floating point .* got torch.uint8"):
+        with pytest.raises(TypeError, match=r"target must be floating point, got torch.uint8"):
             valid_maps(depth, depth.to(torch.uint8))
 
 
