@@ -83,8 +83,8 @@ class TiDyOptics(CameraState):
             where the modulator shows them one by one. An ``nn.Parameter`` is learnt: see
             :class:`~kornia_tidy.psf.LearnableAperture`.
         check_inputs: look at the values of images and depths before any work, eagerly. Inputs in another unit (depth in
-            millimetres, images in 0..255 or normalised) give one warning with the remedy. A sensor checks its light in any
-            case.
+            millimetres, images in 0..255 or normalised) give one warning with the remedy. A sensor checks its light
+            in any case.
         memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
             through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
             a time, also with gradients. That changes nothing but the last digits.
