@@ -605,7 +605,7 @@ static int64_t share_out(const work *w, vec *memory, desk *d) {
 // One depth of a place: its light, or the gradients, which are added to `of_waves` and `of_weights`.
 static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, REAL *of_weights) {
     const scattered *s = w->s;
-    desk own, *d = &own;
+    desk own = {0}, *d = &own;
     const int64_t size = s->shifts * s->window * s->window, out = (place * s->depths + depth) * s->exposures * size;
     share_out(w, w->desks + thread_number() * w->size, d);
     const int64_t rows = 2 + s->phases + s->amplitudes;

@@ -101,9 +101,9 @@ class LayeredScene:
         """Height and width of :attr:`plane`."""
         return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
 
-    @cached_property
+    @property
     def plane(self) -> Tensor:
-        """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels."""
+        """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels; made anew each time."""
         margin = (self.psfs.shape[-1] // 2,) * 4
         return self.image if self.border == "valid" else pad(self.image, margin, PAD_MODES[self.border])
 

@@ -42,15 +42,15 @@ class DenseBackend:
             return occlude_dense(*occlusion_planes(scene), shares)
         index, weight = scene.sorted_layers
         gathers = scene.compositing == "gather"
-        composite = gather_dense if gathers else scatter_dense
+        composite, plane = gather_dense if gathers else scatter_dense, scene.plane
         if scene.field is None:
-            return composite(scene.plane, scene.psfs, weight, index)
-        total = torch.zeros((), dtype=scene.plane.dtype, device=scene.plane.device)
-        for share, psfs in zip(scene.places.of_pixels().to(scene.plane), scene.psfs, strict=True):  # of each node
+            return composite(plane, scene.psfs, weight, index)
+        total = torch.zeros((), dtype=plane.dtype, device=plane.device)
+        for share, psfs in zip(scene.places.of_pixels().to(plane), scene.psfs, strict=True):  # of each node
             if gathers:
-                total = total + share * composite(scene.plane, psfs, weight, index)
+                total = total + share * composite(plane, psfs, weight, index)
             else:
-                total = total + composite(share * scene.plane, psfs, weight, index)
+                total = total + composite(share * plane, psfs, weight, index)
         return total
 
     @torch.enable_grad()

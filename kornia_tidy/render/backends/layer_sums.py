@@ -78,8 +78,8 @@ def seen(scene: LayeredScene, spread: Tensor) -> Tensor:
         scene: that was scattered.
         spread: from :meth:`LayerSums.scatter`.
     """
-    lost = scene.psfs.shape[-1] - 1
-    return spread[..., lost : scene.plane.shape[-2], lost : scene.plane.shape[-1]]
+    lost, (height, width) = scene.psfs.shape[-1] - 1, scene.padded_size
+    return spread[..., lost:height, lost:width]
 
 
 def blend_gradients(scene: LayeredScene, sums: LayerSums, gradient: Tensor) -> GradientPairs:
