@@ -12,8 +12,10 @@ from types import ModuleType
 
 MOVED = {
     "app": "cli.app",
+    "app.controls": "cli.app.settings",
     "calibration": "lab.calibration",
     "camera.image_types": "arrays",
+    "cli.app.controls": "cli.app.settings",
     "coded_datasets": "training.coded_datasets",
     "commands": "cli.commands",
     "data.opencv_arrays": "arrays",
