@@ -281,7 +281,7 @@ def _alike(turned: Sequence[TurnedLens], images: Sequence[Image]) -> list[list[l
 
     Of each lens the numbers of its images.
     """
-    of_lens: dict[tuple[int, int], list[int]] = {}  # a point that is asked for twice is an image of a lens of its own
+    of_lens: dict[tuple[int, int], list[int]] = {}  # the second of two equal points gets another lens
     times: Counter[Image] = Counter()
     for i, image in enumerate(images):
         of_lens.setdefault((image.index, times[image]), []).append(i)

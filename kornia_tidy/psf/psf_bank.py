@@ -24,7 +24,7 @@ class BankOfPSFs:
     """What banks at one place and over the field share: PSFs (..., D, C, P, P), and values (..., D, C) of each."""
 
     axes: ClassVar[tuple[str, ...]]  # of the values of each PSF
-    words: ClassVar[str]  # what a file of them is called
+    words: ClassVar[str]  # the name of their files in messages
     form: ClassVar[str]  # and how it names its format
 
     psfs: Tensor

@@ -50,7 +50,7 @@ class PSFMemory:
 
     def __init__(self, most_bytes: int = 256 << 20) -> None:
         self.most_bytes = most_bytes
-        self._held: dict[Hashable, _Remembered] = {}  # what was used last stands last
+        self._held: dict[Hashable, _Remembered] = {}  # the entry used last stands last
 
     def recall(
         self,
@@ -71,7 +71,7 @@ class PSFMemory:
             form: what to return, made of the tensors. Default: a tuple of them.
             how: tells apart what was made of the same tensors.
         """
-        with torch.inference_mode(False), torch.no_grad():  # what is remembered serves in training too
+        with torch.inference_mode(False), torch.no_grad():  # remembered tensors serve in training too
             known = self._held.pop(key, None) or _Remembered()
             if known.asked != (defocus, how):
                 depths, made = known.depths, ()
@@ -81,7 +81,7 @@ class PSFMemory:
                 # Sums are rounded in an order that follows the layout: it is the same whatever is remembered.
                 whole = missing == defocus
                 found = made if whole else tuple(map(torch.cat, zip(*(depths[psi] for psi in defocus), strict=True)))
-                # What is made of them takes as much again.
+                # The result of `form` takes as much memory again.
                 nbytes = ((not whole) + (form is not None)) * sum(x.nbytes for x in found)
                 nbytes += sum(len(value) for value in key if isinstance(value, bytes))  # of masks
                 if nbytes + sum(x.nbytes for own in depths.values() for x in own) > self.most_bytes:  # all but these go

@@ -238,7 +238,7 @@ class PSFModel:
             return bank if defocus is None else bank.at_defocus(defocus)
         nodes = self.defocus_nodes if defocus is None else tuple(defocus)
         bank = self._computed_bank(spectrum.flat(), dtype, nodes)
-        own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # remembered ones stay as they are
+        own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # users may change these
         return own.with_stray_light(self.fidelity.stray_light)
 
     def _of_lens(

@@ -13,7 +13,7 @@ BEYOND = 6.0  # standard deviations of the noise beyond all neighbours
 CONTRAST = 0.5  # of the range of the neighbours, beyond them: no lens draws a point so much sharper than its surround
 ROWS = 256  # that are worked on together
 BLOCK = 8  # px of a square in which noise is measured, and of JPEG's blocks
-DARKEST_SQUARES = 0.05  # share of squares of a level of light that show the noise alone, those of least variance
+DARKEST_SQUARES = 0.05  # share of the squares of a light level: those of least variance show only noise
 LEVELS = 16  # of light, at which noise is measured
 FEWEST = 64  # squares of a level
 LEAST_OF_EVEN = 0.499  # of the variance: median of the least twentieth of squares, counted on 62,500 of white noise
@@ -21,7 +21,7 @@ LARGEST = 2048  # px, side of the middle of a picture in which noise is measured
 JPEG = 1.1  # least factor of blocks: 1.00 to 1.03 without compression, 1.27 and more at a quality of 92
 JPEG_NOISE = 0.008  # of even noise: of .006, .008 and .01 the best for a quality of 92, four scenes of half A
 FALLING = -0.2  # of the variance in the dark for full light: noise of light rises with it, in encoded pictures it falls
-TWICE = 2.0  # a noise that is told is doubted beyond this factor
+TWICE = 2.0  # a stated noise is doubted beyond this factor
 
 
 class Repaired(NamedTuple):
@@ -53,7 +53,7 @@ def repair_outliers(light: Tensor, noise: MeasuredNoise) -> Repaired:
     """
     height = light.shape[-2]
     whole, count = light, 0
-    for top in range(0, height, ROWS):  # of a large picture, whose copies would take its memory many times
+    for top in range(0, height, ROWS):  # copies of a large picture would take too much memory
         rows = torch.arange(top - 1, min(top + ROWS, height) + 1).abs()
         rows = torch.where(rows < height, rows, 2 * height - 2 - rows)
         part = functional.pad(light[:, rows], (1, 1), "reflect")
@@ -158,7 +158,7 @@ def blockiness(light: Tensor) -> float:
     """
     factors = []
     for axis in (-1, -2):
-        second = light.diff(n=3, dim=axis).abs()  # of which blocks leave more than scenes do
+        second = light.diff(n=3, dim=axis).abs()  # larger at borders of blocks than in scenes
         lines = second.mean([d for d in range(light.ndim) if d != light.ndim + axis])
         usable = len(lines) // BLOCK * BLOCK
         if not usable:

@@ -59,7 +59,7 @@ class DenseBackend:
         given = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
         tensors = [x for x in given if x is not None and x.requires_grad]
         coded = self.render(scene)
-        if not coded.requires_grad:  # stray light alone is asked for, which is added to what a backend renders
+        if not coded.requires_grad:  # only stray light needs a gradient, and it is added later
             return []
         found = torch.autograd.grad(coded, tensors, gradient.to(coded), retain_graph=True, allow_unused=True)
         return gradient_pairs(tensors, found)
