@@ -9,6 +9,7 @@ from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, TiDyOp
 from kornia_tidy.camera.burst import burst, burst_shares
 from kornia_tidy.modulator.modulator import LearnableDwellTimes
 from kornia_tidy.modulator.switching import Switching
+from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0, stray_light="discard")
@@ -33,6 +34,15 @@ class TestBurst(BaseTester):
             burst(camera(modulator=Switching(50e-3)), *scene())
         with pytest.raises(TypeError, match=r"optics must be a camera such as TiDyOptics.*, got the number 5"):
             burst(5, *scene())
+
+    def test_feature_shots_behind_a_lens_see_the_nodes_of_their_mask(self):
+        lens = Lens.named("single-50mm", 17.6, 0.595)
+        fine = Fidelity(window=9, layer_spacing=20.0, field_tolerance=1e-2)
+        optics = camera(camera=lens.camera(8e-6), lens=lens, fidelity=fine).requires_grad_(False)
+        image, depth = torch.rand(1, 3, 96, 96), torch.full((1, 1, 96, 96), 0.8)
+        alone = optics.through_moment(1)
+        assert alone.psf_model.field_of((96, 96)).nodes != optics.psf_model.field_of((96, 96)).nodes
+        assert torch.allclose(burst(optics, image, depth)[:, 1], alone(image, depth) / 3, rtol=1e-6, atol=0)
 
     def test_cardinality(self):
         image, depth = scene()

@@ -91,15 +91,6 @@ class TestMeasuresOverField(BaseTester):
         assert lines[0].split()[:4] == ["0.00", "mm", "0.595", "m"]
         assert {line.index("nm") for line in lines} == {lines[0].index("nm")}
 
-    def test_feature_a_lens_draws_itself_without_masks(self):
-        lens = Lens.from_seidel(50e-3, 17.6, 0.595, 5e-3, coma=1.0, wavelengths=(470e-9, 530e-9, 610e-9))
-        bare = TiDyOptics(NoMask(23), lens.camera(PITCH), lens=lens)
-        drawn, expected = (
-            [image.get_array() for axes in figure.axes for image in axes.images]
-            for figure in (lens.show(2), draw_lens(bare, 2))
-        )
-        assert all(np.array_equal(*pair) for pair in zip(drawn, expected, strict=True))
-
     def test_exception_no_lens(self):
         with pytest.raises(ValueError, match="need a camera with a lens, got none"):
             measures_over_field(TiDyOptics(fidelity="draft"), (0.0,), torch.tensor([0.0]))
