@@ -14,22 +14,12 @@ import kornia.augmentation as K
 import torch
 from torch import Tensor
 
-from kornia_tidy import (
-    DefocusRange,
-    PSFBank,
-    SensorNoise,
-    ThinLensCamera,
-    burst,
-    masks,
-    modulator,
-    moving_capture,
-    optics,
-    reconstruction,
-    render,
-    sensor,
-)
+from kornia_tidy import SensorNoise, masks, modulator, optics, reconstruction, render, sensor
 from kornia_tidy import augmentation as ours
+from kornia_tidy.camera import burst, moving_capture
 from kornia_tidy.data import fill_holes
+from kornia_tidy.optics import DefocusRange, ThinLensCamera
+from kornia_tidy.psf import PSFBank
 from tests.camera.pipeline_samples import camera
 
 Call = Callable[[Tensor], Tensor]

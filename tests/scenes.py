@@ -12,7 +12,7 @@ import cv2
 import pytest
 import torch
 
-from kornia_tidy.data.rgbd import Scene, read_rgbd
+from kornia_tidy.data import Scene, read_rgbd
 from tests.base import DATA, shared
 
 ENTRIES: dict[str, dict[str, Any]] = (

@@ -25,8 +25,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_iter, tree_map_only
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
+from kornia_tidy import PSFBank
 from kornia_tidy.kernels.precision import WITHOUT_FLOAT64
-from kornia_tidy.psf.psf_bank import PSFBank
 
 # Operators that give another view of the same memory and launch nothing, besides those that the schema tells of.
 _NO_LAUNCH = {"detach", "lift_fresh", "alias", "_unsafe_view", "_conj", "_reshape_alias", "set_", "is_same_size"}

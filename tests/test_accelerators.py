@@ -11,7 +11,7 @@ from torch import nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.psf.pupil import pupil_field
-from kornia_tidy.render.compositing import gather
+from kornia_tidy.render import gather
 from tests.base import BaseTester
 from tests.benchmarks.launches import step_counts
 from tests.simulated_device import DEVICE, SimulatedDevice

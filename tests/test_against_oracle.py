@@ -12,20 +12,9 @@ import pytest
 import torch
 from scipy.special import fresnel, sici
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    Fidelity,
-    PixelwiseMask,
-    SensorNoise,
-    Spectrum,
-    ThinLensCamera,
-    TiDyOptics,
-)
-from kornia_tidy.masks import CubicMask, ZernikeMask
-from kornia_tidy.masks.base import PhaseMasks
-from kornia_tidy.modulator import Switching
-from kornia_tidy.optics.materials import FUSED_SILICA
+from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, Switching, TiDyOptics
+from kornia_tidy.masks import CubicMask, PhaseMasks, ZernikeMask
+from kornia_tidy.optics import FUSED_SILICA, DefocusRange, Spectrum, ThinLensCamera
 from kornia_tidy.render.borders import BORDERS
 from tests import oracle
 from tests.base import BaseTester

@@ -6,15 +6,15 @@ import pytest
 
 from kornia_tidy import choices
 from kornia_tidy.camera import camera_state
-from kornia_tidy.design.tradeoff.sweep_settings import PLAN, SWEEP_VALUES
+from kornia_tidy.design.tradeoff import PLAN, SWEEP_VALUES
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.lab.mask_export import placement
 from kornia_tidy.lab.raw.demosaic import METHODS
 from kornia_tidy.lab.raw.develop import HIGHLIGHTS
 from kornia_tidy.modulator import switching
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens import NAMED_LENSES
-from kornia_tidy.optics.published_systems import SYSTEMS
 from kornia_tidy.psf import psf_bank
 from kornia_tidy.reconstruction import metrics
 from kornia_tidy.reconstruction.head_names import ANY_CAMERA

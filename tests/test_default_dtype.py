@@ -14,13 +14,11 @@ from torch import Tensor
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy import augmentation as ours
 from kornia_tidy.choices import STARTS
-from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
-from kornia_tidy.data.patches import random_crop
-from kornia_tidy.data.photographic_leaves import photographic_leaves
+from kornia_tidy.data import DeadLeaves, dead_leaves, photographic_leaves, random_crop
 from kornia_tidy.design import DesignTask
 from kornia_tidy.design.candidates import initial_phase
-from kornia_tidy.masks.initial_heights import initial_heights
-from kornia_tidy.optics.published_systems import SYSTEMS
+from kornia_tidy.masks import initial_heights
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.seeds import item_generator
 from kornia_tidy.training.noisy_crops import random_error, random_gain, random_sensor
 from kornia_tidy.training.scenes import augmented

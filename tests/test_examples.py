@@ -10,8 +10,7 @@ import cv2
 import pytest
 import torch
 
-from kornia_tidy.data.depth_files import write_depth
-from kornia_tidy.data.image_files import write_image
+from kornia_tidy.data import write_depth, write_image
 from tests.base import BaseTester
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data import read_image
 from kornia_tidy.files import only_here, parse_json, read_bytes, read_json, write_bytes, write_folder
 from tests.base import BaseTester
 from tests.forks import fork, wait

@@ -13,7 +13,7 @@ import pytest
 
 from kornia_tidy.data.exr import decode_exr
 from kornia_tidy.data.hdf5 import decode_hdf5
-from kornia_tidy.figures.style import require_matplotlib
+from kornia_tidy.figures import require_matplotlib
 from kornia_tidy.reconstruction.baselines import load_zoedepth
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.search_path import find_program, import_extra, import_installed

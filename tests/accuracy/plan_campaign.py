@@ -25,25 +25,13 @@ from unittest.mock import patch
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy import DefocusRange, DwellTimes, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.accuracy import psf_samples
+from kornia_tidy import DefocusRange, FresnelLens, NoMask, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
+from kornia_tidy.accuracy import RenderPlan, psf_samples
 from kornia_tidy.accuracy.candidates import REFERENCE
 from kornia_tidy.accuracy.plan import LEAST_TOLERANCE, plan_scene
-from kornia_tidy.accuracy.render_plan import RenderPlan
-from kornia_tidy.masks import (
-    CubicMask,
-    FourierMask,
-    FresnelLens,
-    NoMask,
-    PhaseMasks,
-    RadialMask,
-    SpiralMask,
-    ZernikeMask,
-)
-from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, SpatialLightModulator
-from kornia_tidy.optics import Lens, camera_spectrum
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy.modulator import DiffractionEfficiency, DwellTimes, GreyLevels, SpatialLightModulator
+from kornia_tidy.optics import REFERENCE_WAVELENGTH, Lens, annular_aperture, camera_spectrum, circular_aperture
 from kornia_tidy.render.borders import cropped
 from kornia_tidy.render.coarse_gather import gather_group
 from kornia_tidy.render.stray_light import spread_evenly

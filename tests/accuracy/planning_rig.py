@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, interpolate, pad
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.accuracy.planner import Planner
+from kornia_tidy.accuracy import Planner
 from kornia_tidy.camera.strips import Strip
 from tests.scenes import load_scene
 

@@ -9,10 +9,9 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import DefocusRange, Fidelity, TiDyOptics
+from kornia_tidy import DefocusRange, Fidelity, FresnelLens, TiDyOptics
 from kornia_tidy.accuracy import psf_samples
 from kornia_tidy.accuracy.candidates import REFERENCE
-from kornia_tidy.masks import FresnelLens
 from tests.accuracy.adversarial_scenes import COMPOSITINGS, MASK_KINDS, SCENES, TOLERANCES, Case, judge, report
 from tests.accuracy.planning_rig import Rig
 from tests.base import BaseTester

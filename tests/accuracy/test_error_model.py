@@ -6,13 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy import PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.accuracy.depth_energy import Depths, octave_filters
 from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
 from kornia_tidy.accuracy.psf_samples import PSFSamples
 from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, natural_power, power_spectrum
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import render
 from tests.base import BaseTester
 
 FLAT = Depths(torch.zeros(1, 1, 4, 4), -20, 20, "reflect")

@@ -6,14 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, PSFBank, Spectrum, TiDyOptics
 from kornia_tidy.accuracy.candidates import LAYER_SPACINGS, REFERENCE
 from kornia_tidy.accuracy.planner import PlannedScene, Planner
 from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics import camera_spectrum
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.render import render
 from kornia_tidy.render.borders import largest_window
-from kornia_tidy.render.compositing import render
 from tests.accuracy.plan_campaign import trial
 from tests.accuracy.planning_rig import MASKS, Rig, real_scene, smooth
 from tests.base import BaseTester, needs_data

@@ -11,9 +11,9 @@ from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.accuracy.costs import bank_work, rendering_work, window_side
 from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.overlap_ops import SOURCE
+from kornia_tidy.render import layered_scene
 from kornia_tidy.render.backend import transform_operations
 from kornia_tidy.render.dispatch import choose
-from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 
 NODES = tuple(float(psi) for psi in range(-20, 21, 2))

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.augmentation.linear_camera import LinearCamera
+from kornia_tidy.augmentation import LinearCamera
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import camera, scene
 from tests.rounding import gamma

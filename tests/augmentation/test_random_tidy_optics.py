@@ -5,17 +5,9 @@ import math
 import pytest
 import torch
 
-from kornia_tidy import (
-    DefocusRange,
-    Fidelity,
-    PixelwiseMask,
-    SensorNoise,
-    SpatialLightModulator,
-    Switching,
-    ThinLensCamera,
-    TiDyOptics,
-)
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, SpatialLightModulator, Switching, TiDyOptics
 from kornia_tidy.augmentation import RandomTiDyOptics
+from kornia_tidy.optics import DefocusRange, ThinLensCamera
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import FAST, camera, scene
 

@@ -26,20 +26,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from kornia_tidy import (
-    DwellTimes,
-    Fidelity,
-    LearnableDwellTimes,
-    PixelwiseMask,
-    SensorNoise,
-    Spectrum,
-    Switching,
-    ThinLensCamera,
-    TiDyOptics,
-    burst,
-    moving_capture,
-)
-from kornia_tidy.masks import ZernikeMask
+from kornia_tidy import Fidelity, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics, burst, moving_capture
+from kornia_tidy.masks import PixelwiseMask, ZernikeMask
+from kornia_tidy.modulator import DwellTimes, LearnableDwellTimes, Switching
 from kornia_tidy.optics import annular_aperture, camera_spectrum
 
 ROOT = Path(__file__).resolve().parents[2]

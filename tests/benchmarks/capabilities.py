@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import render
 from tests.benchmarks.rendering_against_peers import (
     by_kornia,
     by_one_conv2d,

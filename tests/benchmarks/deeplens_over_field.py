@@ -21,10 +21,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, TiDyOptics
 from kornia_tidy.data import dead_leaves
-from kornia_tidy.psf import PSFBank
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import render
 from kornia_tidy.render.dispatch import Rendering
 from kornia_tidy.render.over_field import render_over_field
 from tests.benchmarks.lens_ratio import LENS, least_times

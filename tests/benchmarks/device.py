@@ -37,7 +37,7 @@ from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, Ti
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.trained import build_optics
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import render
 from kornia_tidy.training.settings import TrainingSettings
 from tests.benchmarks.capabilities import by_depth_interpolation
 from tests.benchmarks.rendering_against_peers import make_bank

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+from kornia_tidy.render import render
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.render.compositing import render
 from tests.base import DATA
 from tests.render.scenes import Bank
 

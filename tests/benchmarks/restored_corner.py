@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity, NoMask, SensorNoise, TiDyOptics
-from kornia_tidy.data.photographic_leaves import photographic_leaves
+from kornia_tidy.data import photographic_leaves
 from kornia_tidy.masks import PhaseMasks, PixelwiseMask, SpiralMask, initial_heights
 from kornia_tidy.optics import Lens
 from kornia_tidy.reconstruction.camera_system import any_camera_system

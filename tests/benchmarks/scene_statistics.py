@@ -11,7 +11,7 @@ import sys
 import torch
 from torch import Tensor
 
-from kornia_tidy.data.patches import central_crop
+from kornia_tidy.data import central_crop
 from kornia_tidy.data.statistics_measurement import linear_light, measured_statistics, radial_spectrum
 from tests.scenes import ENTRIES, halves, load_scene
 

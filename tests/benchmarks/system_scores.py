@@ -8,9 +8,8 @@ from typing import Any
 
 from torch.utils.data import Dataset
 
-from kornia_tidy.data.dead_leaves import DeadLeaves
-from kornia_tidy.data.patches import central_crop
-from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy import ThinLensCamera
+from kornia_tidy.data import DeadLeaves, central_crop
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.tasks import stretched
 from kornia_tidy.reconstruction.trained import load_trained

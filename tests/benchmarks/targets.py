@@ -20,9 +20,9 @@ from torch.nn.functional import interpolate, pad
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
 from kornia_tidy.design.tradeoff.costs import peak_bytes
-from kornia_tidy.optics.spectrum import camera_spectrum
+from kornia_tidy.optics import camera_spectrum
+from kornia_tidy.render import render
 from kornia_tidy.render.borders import next_fast_size
-from kornia_tidy.render.compositing import render
 from tests.benchmarks.rendering_against_peers import (
     RENDERERS,
     ikoma_stack,

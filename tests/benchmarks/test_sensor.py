@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import SensorNoise
-from kornia_tidy.sensor import quantize, shot_noise
+from kornia_tidy.sensor import SensorNoise, quantize, shot_noise
 
 SENSORS = {
     "read": SensorNoise(0.01),

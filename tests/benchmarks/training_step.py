@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import TiDyOptics
-from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data import DeadLeaves
 from kornia_tidy.reconstruction import AttentionUNet, MiDaSSmall
 from kornia_tidy.reconstruction.trained import build_optics
 from kornia_tidy.training.settings import TrainingSettings

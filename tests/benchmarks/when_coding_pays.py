@@ -22,10 +22,8 @@ from typing import Any, NamedTuple
 import torch
 from tqdm import tqdm
 
-from kornia_tidy.data.patches import central_crop
-from kornia_tidy.data.rgbd import Scene
-from kornia_tidy.design.co_design import CoDesign, Effort, co_design
-from kornia_tidy.design.design_task import DesignTask
+from kornia_tidy.data import Scene, central_crop
+from kornia_tidy.design import CoDesign, DesignTask, Effort, co_design
 from kornia_tidy.figures.style import ACCENT, FAINT, INK, open_chart
 from kornia_tidy.files import read_json, write_bytes
 from kornia_tidy.reconstruction.tasks import stretched

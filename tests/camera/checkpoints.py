@@ -16,25 +16,20 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from kornia_tidy import (
-    DefocusRange,
+from kornia_tidy import DefocusRange, Fidelity, PSFBank, SensorNoise, Spectrum, ThinLensCamera, TiDyOptics
+from kornia_tidy.camera import camera_of_state
+from kornia_tidy.masks import CubicMask, FourierMask, FresnelLens, PixelwiseMask, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy.modulator import (
+    DiffractionEfficiency,
     DwellTimes,
-    Fidelity,
-    FresnelLens,
+    GreyLevels,
     LearnableDwellTimes,
-    PixelwiseMask,
-    SensorNoise,
+    PixelCrosstalk,
     SpatialLightModulator,
-    Spectrum,
+    StrokeError,
     Switching,
-    ThinLensCamera,
-    TiDyOptics,
 )
-from kornia_tidy.camera.saved_camera import camera_of_state
-from kornia_tidy.masks import CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
-from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.optics import FUSED_SILICA, PDMS, SYSTEMS, annular_aperture, camera_spectrum
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.state_file import write_state

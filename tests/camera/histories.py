@@ -30,27 +30,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    Fidelity,
-    FresnelLens,
-    LearnableDwellTimes,
-    NoMask,
-    PixelwiseMask,
-    SensorNoise,
-    Spectrum,
-    Switching,
-    ThinLensCamera,
-    TiDyOptics,
-    burst,
-    moving_capture,
-)
-from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy import Fidelity, FresnelLens, NoMask, PixelwiseMask, SensorNoise, TiDyOptics, burst, moving_capture
+from kornia_tidy.camera import camera_of_state
 from kornia_tidy.masks import MASK_SPAN, CubicMask, FourierMask, RadialMask, SpiralMask, ZernikeMask
-from kornia_tidy.modulator import DiffractionEfficiency
-from kornia_tidy.optics import Lens, annular_aperture, camera_spectrum
-from kornia_tidy.sensor.fixed_pattern import draw_pattern
+from kornia_tidy.modulator import DiffractionEfficiency, DwellTimes, LearnableDwellTimes, Switching
+from kornia_tidy.optics import DefocusRange, Lens, Spectrum, ThinLensCamera, annular_aperture, camera_spectrum
+from kornia_tidy.sensor import draw_pattern
 
 T = TypeVar("T")
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNoise, Switching, TiDyOptics
 from kornia_tidy.camera.burst import burst, burst_shares
-from kornia_tidy.modulator.modulator import LearnableDwellTimes
-from kornia_tidy.modulator.switching import Switching
 from kornia_tidy.optics import Lens
 from tests.base import BaseTester
 

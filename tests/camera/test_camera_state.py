@@ -14,15 +14,11 @@ from safetensors.torch import load, save
 from torch import nn
 from torch.optim.swa_utils import AveragedModel
 
-from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, SensorNoise, ThinLensCamera, TiDyOptics
+from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, PSFBank, SensorNoise, Switching, TiDyOptics
 from kornia_tidy.camera import camera_of_state
 from kornia_tidy.masks import CubicMask, RadialMask
-from kornia_tidy.modulator.switching import Switching
-from kornia_tidy.optics import FUSED_SILICA, SYSTEMS
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy.optics import FUSED_SILICA, SYSTEMS, DefocusRange, Spectrum, ThinLensCamera, circular_aperture
 from kornia_tidy.psf.camera_settings import read_settings, write_settings
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.training.average import MovingAverage
 from tests.base import BaseTester
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy.camera import camera_of_state
 from tests.base import BaseTester
 from tests.camera.checkpoints import CAPTURE, FOLDER, KINDS, OTHERS, capture_of, other_cameras
 

@@ -16,16 +16,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    Fidelity,
-    PixelwiseMask,
-    SensorNoise,
-    Spectrum,
-    ThinLensCamera,
-    TiDyOptics,
-)
+from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy.optics import DefocusRange, Spectrum, ThinLensCamera
 from tests.base import BaseTester
 
 BOUND = 1e-4  # of full scale: float32 against float64

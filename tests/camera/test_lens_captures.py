@@ -11,13 +11,11 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from kornia_tidy import NoMask, PixelwiseMask, TiDyOptics
+from kornia_tidy import Fidelity, NoMask, PixelwiseMask, PSFBank, TiDyOptics
 from kornia_tidy.camera import burst, camera_of_state, moving_capture
-from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.optics import Lens, Spectrum
-from kornia_tidy.psf import PSFBank
+from kornia_tidy.render import render
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import render
 from tests.base import BaseTester, shared
 
 CORNER = (507.0, 593.0)  # px from the axis, of a picture of 1282x1110 px

@@ -10,21 +10,10 @@ from torch import Tensor, nn
 
 import kornia_tidy.masks
 import kornia_tidy.modulator
-from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.camera.burst import burst
-from kornia_tidy.camera.motion import moving_capture
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks import CubicMask, FourierMask, FresnelLens, NoMask, RadialMask, SpiralMask, ZernikeMask
-from kornia_tidy.modulator import (
-    DiffractionEfficiency,
-    DwellTimes,
-    GreyLevels,
-    LearnableDwellTimes,
-    PixelCrosstalk,
-    SpatialLightModulator,
-    StrokeError,
-    Switching,
-)
+from kornia_tidy import DwellTimes, Fidelity, FresnelLens, LearnableDwellTimes, NoMask, SpatialLightModulator, Switching
+from kornia_tidy.camera import TiDyOptics, burst, moving_capture
+from kornia_tidy.masks import CubicMask, FourierMask, PixelwiseMask, RadialMask, SpiralMask, ZernikeMask
+from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.optics import Lens, Spectrum, camera_spectrum
 from kornia_tidy.psf import PSFModel
 from kornia_tidy.psf.field import Field

@@ -10,12 +10,11 @@ import torch
 from torch import nn
 
 import kornia_tidy.optics  # noqa: F401 (all modulators are defined)
-from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics
+from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics, burst
 from kornia_tidy.augmentation.drawn_camera import PhaseJitter
-from kornia_tidy.camera.burst import burst
 from kornia_tidy.camera.motion import moment_times, moving_capture, state_times
+from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.modulator.modulator import DiffractionEfficiency, Modulator, SpatialLightModulator, timeline_of
-from kornia_tidy.modulator.phase_panel import GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.optics import SYSTEMS
 from tests.base import BaseTester
 

@@ -8,20 +8,11 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from kornia_tidy import (
-    DwellTimes,
-    Fidelity,
-    LearnableDwellTimes,
-    PixelwiseMask,
-    SensorNoise,
-    Switching,
-    TiDyOptics,
-)
+from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNoise, Switching, TiDyOptics
 from kornia_tidy.camera.motion import moving_capture, scenes_by_flow, scenes_by_homography, state_times
-from kornia_tidy.masks.base import metres_to_radians
-from kornia_tidy.modulator.modulator import SpatialLightModulator
-from kornia_tidy.modulator.phase_panel import GreyLevels
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.masks import metres_to_radians
+from kornia_tidy.modulator import GreyLevels, SpatialLightModulator
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=10.0, stray_light="discard")

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.render import dispatch
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import dispatch, render
 from tests.base import BaseTester
 
 

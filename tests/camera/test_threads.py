@@ -14,8 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.masks import NoMask
+from kornia_tidy import Fidelity, NoMask, PixelwiseMask, ThinLensCamera, TiDyOptics
 from kornia_tidy.psf import exact
 from tests.base import BaseTester
 

@@ -7,17 +7,8 @@ import math
 import pytest
 import torch
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    Fidelity,
-    PixelwiseMask,
-    Spectrum,
-    ThinLensCamera,
-    TiDyOptics,
-)
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.spectrum import camera_spectrum
+from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics import camera_spectrum, circular_aperture
 from kornia_tidy.psf.psf_bank import enclosing_window
 from tests.base import BaseTester
 from tests.rounding import gamma

@@ -5,11 +5,10 @@ import math
 import pytest
 import torch
 
-from kornia_tidy import PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics.aperture import annular_aperture
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.render.compositing import gather
+from kornia_tidy import PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics import REFERENCE_WAVELENGTH, annular_aperture
+from kornia_tidy.psf import exact_psf_bank
+from kornia_tidy.render import gather
 from kornia_tidy.render.dispatch import Rendering
 from kornia_tidy.render.pieces import pieces_of, render_piece
 from tests.base import BaseTester

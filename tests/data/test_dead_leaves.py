@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data import dead_leaves
 from tests.base import BaseTester
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.data.depth_files import read_depth, write_depth
+from kornia_tidy.data import read_depth, write_depth
 from tests.base import BaseTester
 
 STEREO = {"kind": "disparity", "focal_px": 1000.0, "baseline_m": 0.1}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.data.image_files import read_image, write_image
+from kornia_tidy.data import read_image, write_image
 from tests.base import BaseTester
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.utils.data import DataLoader
 
-from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data import DeadLeaves
 from kornia_tidy.data.remembered import Remembered
 from tests.base import BaseTester
 

@@ -6,20 +6,11 @@ import pytest
 import torch
 
 from kornia_tidy.data import SceneStatistics
-from kornia_tidy.design.candidates import (
-    STARTS,
-    coded_candidate,
-    cost_of,
-    flat_candidate,
-    initial_phase,
-    search_lens,
-)
+from kornia_tidy.design import restoration_error
+from kornia_tidy.design.candidates import STARTS, coded_candidate, cost_of, flat_candidate, initial_phase, search_lens
 from kornia_tidy.design.design_task import DesignTask, mask_of
-from kornia_tidy.design.objectives import restoration_error
 from kornia_tidy.design.simulated_captures import candidate_optics, leaf_scenes, score_candidate
-from kornia_tidy.modulator.modulator import SpatialLightModulator
-from kornia_tidy.modulator.phase_panel import GreyLevels
-from kornia_tidy.modulator.switching import Switching
+from kornia_tidy.modulator import GreyLevels, SpatialLightModulator, Switching
 from tests.base import BaseTester
 
 FEW = 3  # gradient steps

@@ -3,10 +3,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.data.rgbd import Scene
+from kornia_tidy import ThinLensCamera
+from kornia_tidy.data import Scene
 from kornia_tidy.design import compared_cameras
 from kornia_tidy.design.compared_cameras import photograph, shipped_cameras, stopped_down
-from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.trained import TrainedSystem, build_head, build_optics, update_psfs

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
+from kornia_tidy.design import DesignTask
 from kornia_tidy.design.candidates import flat_candidate
-from kornia_tidy.design.design_task import DesignTask
 from kornia_tidy.sensor import full_well_of
 from tests.base import BaseTester
 

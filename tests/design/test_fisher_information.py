@@ -7,19 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from kornia_tidy import DefocusRange, Fidelity, LearnableDwellTimes, PixelwiseMask, SpatialLightModulator, Spectrum
-from kornia_tidy.design.fisher_information import (
-    PointResponse,
-    crlb,
-    defocus_bound,
-    defocus_response,
-    fisher_information,
-)
+from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SpatialLightModulator
+from kornia_tidy.design import crlb
+from kornia_tidy.design.fisher_information import PointResponse, defocus_bound, defocus_response, fisher_information
 from kornia_tidy.masks import CubicMask, PhaseMasks, ZernikeMask
-from kornia_tidy.modulator import DwellTimes
-from kornia_tidy.optics import ThinLensCamera, circular_aperture
-from kornia_tidy.optics.materials import PMMA
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.optics import PMMA, DefocusRange, Spectrum, ThinLensCamera, circular_aperture
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester, shared
 from tests.design.published_setting import sampled_response
 

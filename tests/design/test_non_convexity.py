@@ -8,10 +8,9 @@ import torch
 from scipy.signal import correlate2d
 from torch import Tensor
 
-from kornia_tidy import FresnelLens, PixelwiseMask
 from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
-from kornia_tidy.masks import mask_coordinates
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
+from kornia_tidy.masks import FresnelLens, PixelwiseMask, mask_coordinates
+from kornia_tidy.optics import annular_aperture, circular_aperture
 from tests.base import BaseTester
 from tests.polygons import polygon_aperture
 

@@ -6,8 +6,8 @@ import statistics
 import pytest
 import torch
 
+from kornia_tidy.design import DesignTask
 from kornia_tidy.design.candidates import FLAT, Candidate
-from kornia_tidy.design.design_task import DesignTask
 from kornia_tidy.design.verdict import decide, finalist, in_words
 from tests.base import BaseTester
 

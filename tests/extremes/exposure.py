@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, DwellTimes, PixelwiseMask, TiDyOptics
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics import circular_aperture
 from tests.extremes.lens import BOUND, CAPTURE
 from tests.extremes.row import Row, difference, refusals, rounding, scene, worst
 

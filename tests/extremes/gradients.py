@@ -8,8 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from kornia_tidy import DwellTimes, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.modulator import LearnableDwellTimes
+from kornia_tidy import DwellTimes, LearnableDwellTimes, PixelwiseMask, SensorNoise, TiDyOptics
 from tests.extremes.exposure import camera, random_heights
 from tests.extremes.row import Row, difference, scene, worst
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 import torch
 
 from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics.thin_lens import thin_lens_defocus
+from kornia_tidy.optics import thin_lens_defocus
 from tests.extremes.row import Row, difference, refusals, rounding, scene, worst
 
 LENS, CAPTURE = "the lens law in rational numbers, in ulp of the larger term", "float64, full scale 1"

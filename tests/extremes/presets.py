@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity
-from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data import DeadLeaves
 from tests.extremes.exposure import camera
 from tests.extremes.row import Row
 

@@ -3,11 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy import PSFBank
 from kornia_tidy.figures.measured_psfs import draw_measured
-from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
-from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.lab.calibration.psf import MaskFit, MeasuredPSFs, PointReport
+from kornia_tidy.psf import PSFBank, PSFModel
 from tests.base import BaseTester
 
 

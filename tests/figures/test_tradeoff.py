@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from kornia_tidy.design.tradeoff import TradeRun, pareto
-from kornia_tidy.design.tradeoff.sweep_settings import SWEEP_VALUES
+from kornia_tidy.design.tradeoff import SWEEP_VALUES, TradeRun, pareto
 from kornia_tidy.figures.tradeoff import draw_trade
 from tests.base import BaseTester
 from tests.design.tradeoff.samples import CONDITIONS, ROW, whole_sweep

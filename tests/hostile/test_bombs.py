@@ -21,8 +21,8 @@ import torch
 from kornia_tidy.data import NYUDepthV2, read_depth, read_image
 from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.lab.mask_export import read_heights
-from kornia_tidy.lab.raw.capture import RawCapture
-from kornia_tidy.reconstruction.midas_small import load_midas_small
+from kornia_tidy.lab.raw import RawCapture
+from kornia_tidy.reconstruction import load_midas_small
 from kornia_tidy.reconstruction.state_file import read_state
 from kornia_tidy.training.coded_datasets import CodedCaptures
 from tests.base import BaseTester

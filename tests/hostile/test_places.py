@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from kornia_tidy import PixelwiseMask
-from kornia_tidy.data import read_image, write_depth, write_image
-from kornia_tidy.data.dead_leaves import dead_leaves
+from kornia_tidy.data import dead_leaves, read_image, write_depth, write_image
 from kornia_tidy.files import write_bytes, write_folder
 from kornia_tidy.lab.mask_export import write_heights
 from tests.base import BaseTester

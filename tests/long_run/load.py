@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kornia_tidy import PixelwiseMask, TiDyOptics, cli
-from kornia_tidy.data import read_image, read_rgbd, write_depth, write_image
-from kornia_tidy.data.dead_leaves import DeadLeaves, dead_leaves
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy import PixelwiseMask, PSFBank, TiDyOptics, cli
+from kornia_tidy.data import DeadLeaves, dead_leaves, read_image, read_rgbd, write_depth, write_image
 from kornia_tidy.reconstruction import AttentionUNet
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.training.coded_datasets import CodedCaptures, render_scenes

@@ -6,7 +6,7 @@ from torch import nn
 
 from kornia_tidy.masks import PhaseMasks, PixelwiseMask, adam_groups, mask_axes, metres_to_radians
 from kornia_tidy.masks.base import initial_values
-from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
+from kornia_tidy.optics import FUSED_SILICA, constant_index
 from tests.base import BaseTester
 
 

@@ -5,11 +5,9 @@ import math
 import pytest
 import torch
 
-from kornia_tidy.masks.base import mask_axes
-from kornia_tidy.masks.cubic import CubicMask
-from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy import Spectrum
+from kornia_tidy.masks import CubicMask, mask_axes
+from kornia_tidy.psf import Pupil, exact_psf_bank
 from tests.base import BaseTester
 
 TWO_MASKS = {"cubic": lambda **o: CubicMask([4.0, -3.0], **o)}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.masks.fourier import FourierMask
+from kornia_tidy.masks import FourierMask
 from tests.base import BaseTester
 from tests.masks.strong import strong
 

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from kornia_tidy.masks.fresnel import FresnelLens
+from kornia_tidy import FresnelLens
 from tests.base import BaseTester
 
 ONE_MASK = {"Fresnel": lambda g: FresnelLens(), "strong Fresnel": lambda g: FresnelLens(40.0)}

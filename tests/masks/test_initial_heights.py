@@ -6,7 +6,7 @@ import torch
 from kornia_tidy import PixelwiseMask
 from kornia_tidy.choices import STARTS
 from kornia_tidy.masks.initial_heights import CLEAN, SMALL_NOISE, SWEEP, fisher_mask, initial_heights
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 from tests.design.published_setting import design_fisher_mask
 

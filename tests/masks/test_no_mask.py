@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from kornia_tidy import Fidelity, NoMask, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.optics import circular_aperture
+from kornia_tidy.psf import Pupil, exact_psf_bank
 from tests.base import BaseTester
 
 ONE_MASK = {"no mask": lambda g: NoMask()}

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.optics.materials import FUSED_SILICA, constant_index
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy import PixelwiseMask
+from kornia_tidy.optics import FUSED_SILICA, constant_index
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 
 TWO_MASKS = {"pixelwise": lambda **o: PixelwiseMask(2, **o)}

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy.masks.base import mask_axes
-from kornia_tidy.masks.radial import RadialMask
+from kornia_tidy.masks import RadialMask, mask_axes
 from tests.base import BaseTester
 from tests.masks.strong import strong
 

@@ -7,11 +7,9 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from kornia_tidy.masks.spiral import SpiralMask
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.psf.exact import exact_psf_bank
-from kornia_tidy.psf.pupil import Pupil
+from kornia_tidy.masks import SpiralMask
+from kornia_tidy.optics import Spectrum, circular_aperture
+from kornia_tidy.psf import Pupil, exact_psf_bank
 from tests.base import BaseTester
 
 TWO_MASKS = {"spiral": lambda **o: SpiralMask(2, num_zones=3, **{"size": 23, **o})}

@@ -8,9 +8,8 @@ import torch
 from scipy.special import eval_jacobi
 from torch import Tensor
 
-from kornia_tidy.masks.base import mask_axes
-from kornia_tidy.masks.zernike import ZernikeMask
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.masks import ZernikeMask, mask_axes
+from kornia_tidy.optics import circular_aperture
 from kornia_tidy.optics.zernike import zernike_polynomials
 from tests.base import BaseTester
 from tests.masks.strong import strong

@@ -6,10 +6,8 @@ import pytest
 import torch
 from torch.func import functional_call
 
-from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, TiDyOptics
-from kornia_tidy.modulator.modulator import DiffractionEfficiency, LearnableDwellTimes, SpatialLightModulator
-from kornia_tidy.modulator.phase_panel import GreyLevels, PixelCrosstalk
-from kornia_tidy.modulator.switching import Switching
+from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SpatialLightModulator, TiDyOptics
+from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, Switching
 from tests.base import BaseTester
 
 SMALL = Fidelity(window=9, layer_spacing=20.0, stray_light="discard")

@@ -9,14 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.camera.saved_camera import camera_of_state
-from kornia_tidy.optics.aperture import (
-    OpenArea,
-    annular_aperture,
-    check_aperture,
-    circular_aperture,
-    light_through,
-)
+from kornia_tidy.camera import camera_of_state
+from kornia_tidy.optics.aperture import OpenArea, annular_aperture, check_aperture, circular_aperture, light_through
 from tests.base import BaseTester
 
 both_edges = pytest.mark.parametrize("edges", ["binary", "area"])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.optics.materials import FUSED_SILICA, NOA61, PDMS, PMMA, cauchy_through, constant_index
+from kornia_tidy.optics import FUSED_SILICA, NOA61, PDMS, PMMA, cauchy_through, constant_index
 from tests.base import BaseTester, shared
 
 FILES = {

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
+from kornia_tidy.optics import REFERENCE_WAVELENGTH, Spectrum, camera_spectrum
 from tests.base import BaseTester
 
 NIKON, SIGMA = "Nikon 5100 (NPL)", "Sigma SDMerill (NPL)"

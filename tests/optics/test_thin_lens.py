@@ -5,12 +5,9 @@ import math
 import pytest
 import torch
 
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks import PixelwiseMask
-from kornia_tidy.optics.materials import FUSED_SILICA, PMMA
-from kornia_tidy.optics.spectrum import Spectrum
-from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera, thin_lens_defocus
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, ThinLensCamera
+from kornia_tidy.optics import FUSED_SILICA, PMMA, Spectrum, thin_lens_defocus
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 
 

@@ -15,28 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    Fidelity,
-    PixelwiseMask,
-    SensorNoise,
-    SpatialLightModulator,
-    ThinLensCamera,
-    TiDyOptics,
-)
+from kornia_tidy import DefocusRange, Fidelity, PSFBank, SensorNoise, ThinLensCamera, TiDyOptics, burst, moving_capture
 from kornia_tidy.arrays import depth_tensor
-from kornia_tidy.camera.burst import burst
-from kornia_tidy.camera.motion import moving_capture
 from kornia_tidy.cli import main
-from kornia_tidy.data.depth_files import read_depth, write_depth
+from kornia_tidy.data import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.lab.mask_export import frame_times
-from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.masks.initial_heights import initial_heights
-from kornia_tidy.modulator.modulator import LearnableDwellTimes
-from kornia_tidy.modulator.switching import Switching
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.masks import PixelwiseMask, ZernikeMask, initial_heights
+from kornia_tidy.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator, Switching
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.reconstruction.trained import check_weights
 from tests.base import BaseTester, shared

@@ -12,7 +12,7 @@ from examples.paper import burst, theorem
 from examples.paper.readme import EXPERIMENTS
 from examples.paper.runner import ABOUT, main, run
 from kornia_tidy.design.non_convexity import autocorrelation_bound, extreme_points
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics import circular_aperture
 from tests.base import BaseTester
 
 NAMES = ("theorem", "switching_time", "boundaries", "burst")

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicHermiteSpline
 
-from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, PSFBank, TiDyOptics
 from kornia_tidy.psf.defocus_interpolation import (
     defocus_band,
     fine_layer_matrix,
@@ -14,7 +14,6 @@ from kornia_tidy.psf.defocus_interpolation import (
     interpolated_bank,
     interpolation_matrix,
 )
-from kornia_tidy.psf.psf_bank import PSFBank
 from tests.base import BaseTester
 
 BAND = defocus_band(1.0, 470e-9, 530e-9)

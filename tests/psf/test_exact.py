@@ -9,11 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.materials import FUSED_SILICA
-from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.optics import FUSED_SILICA, circular_aperture
+from kornia_tidy.psf import Pupil, exact_psf_bank
 from kornia_tidy.psf.propagation import gauss_legendre_order
-from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester
 from tests.masks.registry import ONE_MASK
 

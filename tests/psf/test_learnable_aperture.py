@@ -8,12 +8,9 @@ import pytest
 import torch
 from torch import nn
 
-from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Switching, TiDyOptics
-from kornia_tidy.camera.burst import burst
-from kornia_tidy.camera.motion import moving_capture
-from kornia_tidy.camera.saved_camera import camera_of_state
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.lens.lens import Lens
+from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, Switching, TiDyOptics, burst, moving_capture
+from kornia_tidy.camera import camera_of_state
+from kornia_tidy.optics import Lens, circular_aperture
 from kornia_tidy.psf import LearnableAperture
 from tests.base import BaseTester
 

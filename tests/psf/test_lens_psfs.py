@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import NoMask, PixelwiseMask, ThinLensCamera, TiDyOptics
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.modulator.modulator import DwellTimes, SpatialLightModulator
+from kornia_tidy import DwellTimes, Fidelity, NoMask, PixelwiseMask, SpatialLightModulator, ThinLensCamera, TiDyOptics
 from kornia_tidy.optics import Lens, Spectrum, circular_aperture
 from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.zernike import zernike_polynomials

@@ -8,15 +8,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.augmentation.linear_camera import LinearCamera
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.optics import Spectrum
+from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, Spectrum, TiDyOptics
+from kornia_tidy.augmentation import LinearCamera
 from kornia_tidy.psf import FieldBank, PSFBank
 from kornia_tidy.psf.measured_field import place_weights
-from kornia_tidy.reconstruction import Wiener
-from kornia_tidy.reconstruction.restored_over_field import restored_over_field
-from kornia_tidy.render.compositing import render
+from kornia_tidy.reconstruction import Wiener, restored_over_field
+from kornia_tidy.render import render
 from tests.base import BaseTester
 
 SETTINGS = Fidelity(window=17, layer_spacing=10.0, field_tolerance=5e-3)

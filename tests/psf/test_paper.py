@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.optics.spectrum import Spectrum
+from kornia_tidy import DefocusRange, PixelwiseMask, Spectrum, TiDyOptics
+from kornia_tidy.optics import circular_aperture
 from kornia_tidy.psf.paper import AliasingWarning, padded_size, paper_psf_bank, paper_psfs, warn_if_aliased
 from tests.base import BaseTester, shared
 

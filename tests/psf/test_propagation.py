@@ -11,7 +11,7 @@ import torch
 from scipy.integrate import quad
 from scipy.special import j1
 
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics import circular_aperture
 from kornia_tidy.psf.energies import pixel_energies
 from kornia_tidy.psf.propagation import (
     cell_integrals,

@@ -7,11 +7,9 @@ import torch
 from torch._dynamo.testing import CompileCounter
 
 from kornia_tidy import PixelwiseMask, Spectrum, TiDyOptics
-from kornia_tidy.psf import psf_ops
-from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.psf import Pupil, exact_psf_bank, psf_ops
 from kornia_tidy.psf.psf_cache import PSFMemory
 from kornia_tidy.psf.psf_ops import operator_psf_bank
-from kornia_tidy.psf.pupil import Pupil
 from tests.base import BaseTester
 
 LENS = [1.0, 1.1], [-3.0, 0.0, 2.0], 2e-7, 9, 1e-2, [0.0, 0.3]  # dispersion to chromatic defocus

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import DwellTimes, Spectrum, TiDyOptics
-from kornia_tidy.modulator.modulator import SpatialLightModulator
-from kornia_tidy.optics.aperture import circular_aperture
-from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy import DwellTimes, SpatialLightModulator, Spectrum, TiDyOptics
+from kornia_tidy.optics import circular_aperture
+from kornia_tidy.psf import exact_psf_bank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 from tests.base import BaseTester
 

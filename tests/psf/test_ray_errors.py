@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from kornia_tidy.optics import Lens
+from kornia_tidy.optics.lens import NAMED_LENSES, Prescription
 from kornia_tidy.optics.lens.first_order import first_order
 from kornia_tidy.optics.lens.joined_rays import inverse_distance
-from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
-from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.rays import Rays, trace
 from kornia_tidy.psf.lens_psfs import turned_lenses
 from kornia_tidy.psf.ray_errors import ray_errors, rays_in_stop

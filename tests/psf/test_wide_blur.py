@@ -5,12 +5,11 @@ import math
 import pytest
 import torch
 
-from kornia_tidy import Fidelity, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy import Fidelity, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.aperture import OpenArea
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
-from kornia_tidy.psf.exact import exact_psf_bank
+from kornia_tidy.psf import PSFModel, exact_psf_bank
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
-from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.wide_blur import FINE_RADIUS, blurs_widely, wide_blur, window_of
 from kornia_tidy.psf.wide_psfs import held_nodes, is_flat

@@ -6,10 +6,9 @@ import pytest
 import torch
 from kornia.filters import gaussian_blur2d
 
-from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction import ruled_closed_form
+from kornia_tidy import PSFBank
+from kornia_tidy.reconstruction import RuledClosedForm, ruled_closed_form
 from kornia_tidy.reconstruction.clipped_light import MOST, beyond_full_scale
-from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 
 NOISE = 0.004
 

@@ -7,7 +7,7 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch.nn import functional
 
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import (
     ClosedFormHead,
     JointClosedFormHead,

@@ -12,7 +12,7 @@ import torch
 from kornia_tidy import reconstruct
 from kornia_tidy.choices import REPLACED
 from kornia_tidy.cli.app.settings import Settings
-from kornia_tidy.data.dead_leaves import DeadLeaves
+from kornia_tidy.data import DeadLeaves
 from kornia_tidy.lab.named_system import head_file
 from kornia_tidy.reconstruction.pretrained import (
     FOLDER,

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.signal import convolve2d
 
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import AttentionUNet, ReconstructionHead, Refocused, receptive_field, reconstruct_tiled
 from kornia_tidy.reconstruction.refocused import inverse_filters
 from kornia_tidy.reconstruction.tikhonov import tikhonov_layers

@@ -9,13 +9,13 @@ import torch
 from kornia_tidy.reconstruction import (
     JointClosedFormHead,
     JointHead,
+    MiDaSSmall,
     NAFNet,
     SelfEnsemble,
     closed_form_channels,
     self_ensemble,
 )
 from kornia_tidy.reconstruction.heads import PlainHead
-from kornia_tidy.reconstruction.midas_small import MiDaSSmall
 from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from tests.base import BaseTester
 from tests.reconstruction.test_closed_form import bank, photo

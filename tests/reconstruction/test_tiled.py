@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import (
     AttentionUNet,
     ClosedFormHead,

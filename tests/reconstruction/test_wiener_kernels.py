@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.data.scene_statistics import SceneStatistics
+from kornia_tidy.data import SceneStatistics
 from kornia_tidy.reconstruction.wiener import wiener
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 from tests.base import BaseTester

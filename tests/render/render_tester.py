@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kornia_tidy.render import render
 from kornia_tidy.render.backend import Backend
 from kornia_tidy.render.backends.batched import BatchedBackend
-from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS
 from tests.base import BaseTester
 from tests.render.scenes import Bank

@@ -6,14 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy import PSFBank
+from kornia_tidy.optics import REFERENCE_WAVELENGTH, annular_aperture, circular_aperture
 from kornia_tidy.psf.geometric_psf import geometric_psfs
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil, pupil_over
 from kornia_tidy.psf.wide_blur import GRID_ERROR, SCENE_DEVIATION, window_of
+from kornia_tidy.render import gather
 from kornia_tidy.render.coarse_gather import _sharpened
-from kornia_tidy.render.compositing import gather
 from kornia_tidy.render.dispatch import Rendering
 from kornia_tidy.render.pieces import Piece, render_piece
 from tests.base import BaseTester

@@ -9,10 +9,9 @@ import torch
 
 from kornia_tidy.kernels import gather_ops, occlusion_ops
 from kornia_tidy.kernels.build import compiled
-from kornia_tidy.render import dispatch
+from kornia_tidy.render import dispatch, layered_scene
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.dispatch import BACKENDS, choose, explain
-from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.scenes import make_bank, make_scene
 from tests.simulated_device import SimulatedDevice

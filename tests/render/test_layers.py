@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.render import assign_layers
 from kornia_tidy.render.layers import layer_weights, present_layers, weight_of_layer
-from kornia_tidy.render.scene import assign_layers
 from tests.base import BaseTester
 from tests.render.scenes import brute_weights
 

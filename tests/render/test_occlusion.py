@@ -7,10 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kornia_tidy.render import layer_weights, render
 from kornia_tidy.render.backends.dense_occlusion import EPSILON, cumulative_weight, lay_over
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import render
-from kornia_tidy.render.layers import layer_weights
 from tests.base import BaseTester
 from tests.render.render_tester import METHODS
 from tests.render.scenes import Bank, make_bank, make_scene, squares

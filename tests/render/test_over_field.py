@@ -9,12 +9,10 @@ import torch
 
 from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
-from kornia_tidy.render import over_field
+from kornia_tidy.render import layered_scene, over_field, render
 from kornia_tidy.render.borders import BORDERS
-from kornia_tidy.render.compositing import render
 from kornia_tidy.render.dispatch import BACKENDS, Rendering, explain, render_layers
 from kornia_tidy.render.over_field import render_over_field
-from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.kernels.operator_tester import needs_compiler
 

@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 
 from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, TiDyOptics
 from kornia_tidy.optics import SYSTEMS
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render import render
 from kornia_tidy.render.stray_light import normalised_share, share_within
 from tests.base import BaseTester
 from tests.render.scenes import brute_share_within

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
-from kornia_tidy.reconstruction.closed_form import ClosedForm
+from kornia_tidy.reconstruction import ClosedForm
 from kornia_tidy.reconstruction.trained import update_psfs
 from kornia_tidy.sensor import draw_pattern
 from tests.base import BaseTester

@@ -9,11 +9,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from kornia_tidy import DwellTimes, SpatialLightModulator
 from kornia_tidy.cli import main
 from kornia_tidy.design import Candidate, CoDesign, DesignTask, Finalist, Verdict, design_files
 from kornia_tidy.design.candidates import FLAT
-from kornia_tidy.modulator import GreyLevels
+from kornia_tidy.modulator import DwellTimes, GreyLevels, SpatialLightModulator
 from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.design_folder import designed_settings
 from kornia_tidy.training.settings import TrainingSettings

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
-from kornia_tidy.design.objectives import restoration_error
-from kornia_tidy.masks.initial_heights import initial_heights
+from kornia_tidy.design import restoration_error
+from kornia_tidy.masks import initial_heights
 from kornia_tidy.reconstruction.trained import build_optics
 from kornia_tidy.training.designed import SCENE_SPREAD, design_masks
 from kornia_tidy.training.settings import TrainingSettings

@@ -10,7 +10,7 @@ from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.data import DeadLeaves
 from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.trained import build_optics, check_weights, load_trained, load_weights
-from kornia_tidy.sensor.exposure import electrons_at
+from kornia_tidy.sensor import electrons_at
 from kornia_tidy.training.scenes import Broken, SceneLoader
 from kornia_tidy.training.settings import TrainingSettings
 from tests.base import BaseTester

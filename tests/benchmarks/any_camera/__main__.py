@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from kornia_tidy.data.photo_collages import photographs_in
+from kornia_tidy.data import photographs_in
 from kornia_tidy.reconstruction.any_camera import WEIGHTS
 from tests.benchmarks.any_camera.cameras import POOLS
 from tests.benchmarks.any_camera.captures import photograph, photograph_collages, photograph_pictures

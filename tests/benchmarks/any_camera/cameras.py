@@ -8,24 +8,9 @@ from pathlib import Path
 
 import torch
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks import (
-    CubicMask,
-    FourierMask,
-    FresnelLens,
-    NoMask,
-    PhaseMasks,
-    PixelwiseMask,
-    RadialMask,
-    SpiralMask,
-    ZernikeMask,
-    initial_heights,
-)
-from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.optics.thin_lens import ThinLensCamera
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy import Fidelity, FresnelLens, NoMask, PixelwiseMask, PSFBank, ThinLensCamera, TiDyOptics
+from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, RadialMask, SpiralMask, ZernikeMask, initial_heights
+from kornia_tidy.optics import REFERENCE_WAVELENGTH, Lens
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.trained import TrainedSystem, closed_form_bank, load_trained
 from kornia_tidy.seeds import keyed_seed

@@ -14,11 +14,9 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.data.dead_leaves import dead_leaves
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy import TiDyOptics
+from kornia_tidy.data import dead_leaves, photographic_leaves, read_image
 from kornia_tidy.data.photo_collages import grain, photo_collage
-from kornia_tidy.data.photographic_leaves import photographic_leaves
 from kornia_tidy.reconstruction.tasks import metres
 from kornia_tidy.seeds import keyed_seed
 from tests.benchmarks.any_camera.cameras import SHIPPED, camera, pool_names

@@ -10,13 +10,13 @@ import torch
 from kornia.color import linear_rgb_to_rgb
 from torch import Tensor
 
+from kornia_tidy import SensorNoise
 from kornia_tidy.files import write_bytes
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.trained import closed_form_bank
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
-from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera, in_words, pool_names
 from tests.benchmarks.any_camera.captures import LEVELS, stored
 

@@ -9,15 +9,13 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.files import write_bytes
-from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.capture_checks import check_capture
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tasks import metres
-from kornia_tidy.sensor.sensor import SensorNoise
 from tests.benchmarks.any_camera.cameras import camera
 from tests.benchmarks.any_camera.scores import READ_ELECTRONS, scored_scenes
 from tests.benchmarks.any_camera.training import compressed, demosaiced, shifted

@@ -16,21 +16,19 @@ from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
+from kornia_tidy import SensorNoise, ThinLensCamera, TiDyOptics
 from kornia_tidy.data.photo_collages import grain
 from kornia_tidy.files import write_bytes
 from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
-from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.optics import REFERENCE_WAVELENGTH
+from kornia_tidy.reconstruction import RuledClosedForm
 from kornia_tidy.reconstruction.any_camera import any_camera_head, corrected, largest_share
 from kornia_tidy.reconstruction.capture_checks import JPEG_NOISE
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.noisy_crops import random_gain
 from kornia_tidy.training.task_loss import psnr_ssim_loss

@@ -11,12 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.reconstruction import head
+from kornia_tidy.reconstruction import Wiener, head
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.self_ensemble import self_ensemble, takes_orientations
 from kornia_tidy.reconstruction.tasks import MAPS, depth_logits, split_maps
 from kornia_tidy.reconstruction.tikhonov import tikhonov
-from kornia_tidy.reconstruction.wiener import Wiener
 from tests.benchmarks.results.captures import Capture, encode
 from tests.benchmarks.results.systems import System
 

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from kornia_tidy.data.dead_leaves import DeadLeaves
-from kornia_tidy.data.patches import central_crop
-from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy import ThinLensCamera
+from kornia_tidy.data import DeadLeaves, central_crop
 from kornia_tidy.reconstruction.tasks import metres, normalised_inverse_depth, stretched
 from tests.benchmarks.system_scores import LARGEST, LEAVES, LEAVES_SEED, LEAVES_SIZE
 from tests.scenes import ENTRIES, halves, load_scene

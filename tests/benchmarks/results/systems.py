@@ -10,12 +10,8 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.masks.fresnel import FresnelLens
-from kornia_tidy.masks.pixelwise import PixelwiseMask
-from kornia_tidy.optics.published_systems import SYSTEMS
-from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy import Fidelity, FresnelLens, PixelwiseMask, ThinLensCamera, TiDyOptics
+from kornia_tidy.optics import SYSTEMS
 from kornia_tidy.reconstruction.hub import from_pretrained
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained
 from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from kornia_tidy.design.candidates import FLAT
 from kornia_tidy.design.design_report import DATA
 from kornia_tidy.files import read_json
-from kornia_tidy.sensor.exposure import electrons_at
+from kornia_tidy.sensor import electrons_at
 from tests.benchmarks.results.captures import FIXED, PHYSICAL, REFERENCE_F_NUMBER
 from tests.benchmarks.results.measure import BEST_RAMP, NO_CAMERA, NO_NOISE
 from tests.benchmarks.results.restorations import BY_DEPTH, ENSEMBLE, NETWORK

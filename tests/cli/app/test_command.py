@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kornia_tidy.cli.command_line import main
+from kornia_tidy.cli import main
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[3]

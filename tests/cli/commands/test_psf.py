@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from kornia_tidy import Fidelity, NoMask, PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data import read_image
 from tests.base import BaseTester
 from tests.optics.lens.written_files import doublet, zemax
 

@@ -6,9 +6,9 @@ import torch
 
 from kornia_tidy import PixelwiseMask, PSFBank, Spectrum, ThinLensCamera, TiDyOptics
 from kornia_tidy.cli import main
-from kornia_tidy.data.image_files import write_image
+from kornia_tidy.data import write_image
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs
-from kornia_tidy.masks.initial_heights import fisher_mask
+from kornia_tidy.masks import fisher_mask
 from tests.base import BaseTester
 from tests.lab.calibration.psf.captures import exposed, on_pixels, planes, point_light
 

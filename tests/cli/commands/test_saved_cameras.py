@@ -12,27 +12,24 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from kornia_tidy import (
-    DefocusRange,
-    DwellTimes,
-    LearnableDwellTimes,
-    SensorNoise,
-    SpatialLightModulator,
-    Switching,
-    ThinLensCamera,
-    TiDyOptics,
-)
+from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, SensorNoise, TiDyOptics
 from kornia_tidy import optics as optics_package
-from kornia_tidy.camera.saved_camera import camera_of_state
+from kornia_tidy.camera import camera_of_state
 from kornia_tidy.cli import main
-from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.lab.mask_export import read_slm_frames
-from kornia_tidy.masks import PixelwiseMask
 from kornia_tidy.masks.limits import CONSTRAINTS
-from kornia_tidy.modulator import DiffractionEfficiency, GreyLevels, PixelCrosstalk, StrokeError
-from kornia_tidy.optics import SYSTEMS, Material, constant_index
+from kornia_tidy.modulator import (
+    DiffractionEfficiency,
+    DwellTimes,
+    GreyLevels,
+    LearnableDwellTimes,
+    PixelCrosstalk,
+    SpatialLightModulator,
+    StrokeError,
+    Switching,
+)
+from kornia_tidy.optics import SYSTEMS, DefocusRange, Material, ThinLensCamera, constant_index
 from kornia_tidy.psf.camera_settings import read_settings, write_settings
-from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.state_file import write_state
 from tests.base import BaseTester
 from tests.masks.registry import ONE_MASK, TWO_MASKS

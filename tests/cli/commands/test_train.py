@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy.cli import main
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data import read_image
 from kornia_tidy.reconstruction.trained import load_trained
 from kornia_tidy.training.settings import NETWORK_RUN, TrainingSettings
 from tests.base import BaseTester

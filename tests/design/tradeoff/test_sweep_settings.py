@@ -5,7 +5,7 @@ from dataclasses import fields
 import pytest
 
 from kornia_tidy import Fidelity
-from kornia_tidy.design.tradeoff.sweep_settings import SWEEP_VALUES, sweep_settings
+from kornia_tidy.design.tradeoff import SWEEP_VALUES, sweep_settings
 from kornia_tidy.fidelity import PRESETS
 from tests.base import BaseTester
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.lab.mask_export.response_file import read_response
+from kornia_tidy.lab.mask_export import read_response
 from tests.base import BaseTester
 
 PLAIN = np.linspace(0, 6.5, 256)

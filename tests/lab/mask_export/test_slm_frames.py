@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import DwellTimes, Fidelity, PixelwiseMask, SpatialLightModulator, TiDyOptics
-from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
+from kornia_tidy.lab.mask_export import SLMFrames
 from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.modulator.phase_panel import GreyLevels
+from kornia_tidy.modulator import GreyLevels
 from kornia_tidy.optics import NOA61
 from tests.base import BaseTester
 

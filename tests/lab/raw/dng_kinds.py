@@ -17,7 +17,7 @@ import imagecodecs
 import numpy as np
 import torch
 
-from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.filter_array import tiled
 from tests.lab.raw.dng import BYTE, LONG, RATIONAL, SHORT, SRATIONAL, UNDEFINED, XTRANS, dng
 from tests.lab.raw.forked import forked_decoding

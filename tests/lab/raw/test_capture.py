@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.filter_array import filter_tile, tile_planes
 from tests.base import DATA, BaseTester, shared
 from tests.lab.raw.dng import XTRANS, dng

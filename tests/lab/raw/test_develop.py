@@ -10,7 +10,7 @@ import rawpy
 import torch
 from kornia.color import rgb_to_linear_rgb
 
-from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw import RawCapture
 from kornia_tidy.lab.raw.color import assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.lab.raw.develop import balance_factors, default_method, develop, srgb_matrix
 from tests.base import BaseTester, shared

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from kornia_tidy import ThinLensCamera
-from kornia_tidy.optics import Lens, LensRangeWarning
+from kornia_tidy.optics import Lens, LensRangeWarning, ThinLensCamera
+from kornia_tidy.optics.lens import Prescription
 from kornia_tidy.optics.lens.first_order import first_order
 from kornia_tidy.optics.lens.joined_rays import wavefronts
 from kornia_tidy.optics.lens.lens_table import osa_indices
 from kornia_tidy.optics.lens.made_lenses import RGB
-from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.stop_quadrature import stop_quadrature
 from kornia_tidy.optics.zernike import zernike_polynomials
 from tests.base import BaseTester, shared

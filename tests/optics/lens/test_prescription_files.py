@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from kornia_tidy.optics import Lens
+from kornia_tidy.optics.lens import Prescription
 from kornia_tidy.optics.lens.codev_file import read_codev
 from kornia_tidy.optics.lens.file_surfaces import lens_of
 from kornia_tidy.optics.lens.first_order import first_order
 from kornia_tidy.optics.lens.glasses import catalogue_glass
 from kornia_tidy.optics.lens.json_lenses import read_json_lens
-from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.lens.prescription_files import read_prescription_file
 from kornia_tidy.optics.lens.zemax_file import read_zemax
 from tests.base import BaseTester

@@ -7,9 +7,8 @@ import json
 import math
 from typing import Any
 
+from kornia_tidy.optics.lens import NAMED_LENSES, Prescription
 from kornia_tidy.optics.lens.first_order import first_order
-from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
-from kornia_tidy.optics.lens.prescription import Prescription
 
 D_LINE = 587.5618e-9
 

@@ -16,10 +16,10 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct
 from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.kernels.window_sides import is_window_size
+from kornia_tidy.render import layered_scene
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, occlusion, render
 from kornia_tidy.render.dispatch import choose
-from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.backends.test_batched import ATOL, depth_map
 from tests.render.render_tester import RenderTester

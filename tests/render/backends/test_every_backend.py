@@ -8,10 +8,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from kornia_tidy.render import layered_scene
 from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.dispatch import BACKENDS, refusal
-from kornia_tidy.render.scene import layered_scene
 from tests.base import BaseTester
 from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
 from tests.render.scenes import Bank, make_bank, make_scene, squares

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from kornia_tidy.training.coded_datasets import Layout
 from kornia_tidy.training.coded_datasets.item_files import decode_map, encode_item
-from kornia_tidy.training.coded_datasets.layout import Layout
 from tests.base import BaseTester
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kornia_tidy.training.coded_datasets.layout import Layout
+from kornia_tidy.training.coded_datasets import Layout
 from tests.base import BaseTester
 
 

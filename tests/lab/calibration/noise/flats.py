@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
+from kornia_tidy.lab.raw import RawCapture, RawInfo
 
 LEVELS = (0.0, 0.0, 0.02, 0.02, 0.1, 0.1, 0.3, 0.3, 0.7, 0.7)  # of saturation
 

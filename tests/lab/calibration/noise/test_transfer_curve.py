@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from kornia_tidy.lab.calibration.noise.transfer_curve import spatial_points, temporal_points
-from kornia_tidy.lab.raw.capture import RawCapture
+from kornia_tidy.lab.raw import RawCapture
 from tests.base import BaseTester
 from tests.lab.calibration.noise.flats import flat
 

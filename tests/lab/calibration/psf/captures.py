@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from kornia_tidy import Spectrum, ThinLensCamera
 from kornia_tidy.masks import PhaseMasks
-from kornia_tidy.optics import circular_aperture
+from kornia_tidy.optics import Spectrum, ThinLensCamera, circular_aperture
 from kornia_tidy.psf import Pupil, exact_psf_bank
 
 FINE = 9  # subdivisions of a pixel along each side; points have positions on this grid

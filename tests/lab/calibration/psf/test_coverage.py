@@ -17,7 +17,7 @@ from torch import Tensor
 
 from kornia_tidy import PixelwiseMask, SensorNoise, Spectrum, ThinLensCamera
 from kornia_tidy.lab.calibration.psf import diffraction_cutoff, measure_psfs, point_images
-from kornia_tidy.masks.initial_heights import fisher_mask
+from kornia_tidy.masks import fisher_mask
 from tests.base import BaseTester
 from tests.lab.calibration.psf.captures import FINE, exposed, on_pixels, point_light
 

@@ -9,7 +9,7 @@ from kornia_tidy import Fidelity, PixelwiseMask, PSFBank, Spectrum, ThinLensCame
 from kornia_tidy.lab.calibration.psf import fit_masks, retrieve_mask
 from kornia_tidy.lab.calibration.psf.phase_retrieval import one_height
 from kornia_tidy.masks import ZernikeMask
-from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 
 SMALL = Fidelity("small", window=17)

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from kornia_tidy.lab.calibration.psf import register
 from kornia_tidy.lab.calibration.psf.point_images import MARGIN, PointImage
-from kornia_tidy.lab.calibration.psf.registration import register
 from tests.base import BaseTester
 
 SIDE = 15 + 2 * MARGIN
