@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> Path:
 
     options.output.mkdir(parents=True, exist_ok=True)
     write_image(options.output / "scene.png", image)
-    write_image(options.output / "coded.png", coded.detach())
+    write_image(options.output / "coded.png", coded)
     print(optics)
     print(f"{image.shape[-2]}x{image.shape[-1]} pixels, depth {depth.min():.3g} to {depth.max():.3g} m")
     print(f"wrote {options.output / 'scene.png'} and {options.output / 'coded.png'}")
