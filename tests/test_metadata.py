@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import sys
 import tomllib
@@ -25,6 +26,16 @@ class TestMetadata(BaseTester):
     def test_smoke_the_citation_is_of_this_version(self):
         lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
         assert f"version: {kornia_tidy.__version__}" in lines
+
+    def test_smoke_the_changelog_has_a_section_for_this_version(self):
+        """``release.yml`` publishes it."""
+        lines = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").splitlines()
+        assert lines.count(f"## {kornia_tidy.__version__}") == 1
+
+    @pytest.mark.parametrize("path", sorted((ROOT / ".github" / "workflows").glob("*.yml")), ids=lambda path: path.stem)
+    def test_smoke_workflows_make_targets_that_exist(self, path):
+        targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+        assert set(re.findall(r"run: make ([\w-]+)", path.read_text(encoding="utf-8"))) <= targets
 
     def test_smoke_the_package_runs_as_the_command(self, monkeypatch, capsys):
         monkeypatch.setattr(sys, "argv", ["kornia_tidy", "--version"])
