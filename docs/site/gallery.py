@@ -34,6 +34,7 @@ TITLES = {
 }
 # Smaller than the defaults where these take minutes: each page shows the command that made it.
 ARGUMENTS = {
+    "plain_training_loop": "--steps 60",
     "learn_point_psf": "--masks 1 3 5 --trials 1",
     "learn_with_switching": "--trials 1 --iterations 60",
     "mask_families": "--trials 1 --iterations 60",
