@@ -325,15 +325,11 @@ class TestDepthWithHoles(BaseTester):
 
     def test_exception_without_the_option_a_hole_is_refused(self, way):
         """With the line to type."""
-        with pytest.raises(
-            ValueError, match=r"got 0\.0: fill holes with depth, valid = kornia_tidy\.data\.fill_holes\("
-        ):
+        with pytest.raises(ValueError, match=r"fill holes with depth, valid = kornia_tidy\.data\.fill_holes\("):
             way.take("error", picture(), nyu(), "never")
 
     def test_exception_holes_alone_are_refused(self, way):
-        with pytest.raises(
-            ValueError, match="known at one pixel or more, and map 0 of 1 holds 0, NaN or masked pixels"
-        ):
+        with pytest.raises(ValueError, match="at one pixel or more, and map 0 of 1 holds 0, NaN or masked pixels"):
             way.take("fill", picture(), np.zeros((HEIGHT, WIDTH), np.float32), "never")
 
     def test_exception_whole_numbers_ask_for_their_scale(self, way):

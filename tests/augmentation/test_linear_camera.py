@@ -90,9 +90,7 @@ class TestLinearCamera(BaseTester):
 
     def test_exception(self):
         depth = scene(1)[1]
-        with pytest.raises(
-            ValueError, match="a linear camera needs compositing 'gather' or 'scatter', got 'occlusion'"
-        ):
+        with pytest.raises(ValueError, match="needs compositing 'gather' or 'scatter', got 'occlusion'"):
             LinearCamera(linear("occlusion"), depth)
         with pytest.raises(TypeError, match="optics must be a camera"):
             LinearCamera(torch.nn.Identity(), depth)

@@ -174,6 +174,11 @@ def equal_cases() -> Iterator[tuple[str, Callable[[], Work]]]:
 
 
 EQUAL = dict(equal_cases())
+LARGE: dict[str, Callable[[], Work]] = {  # of which vector_widths compares times and numbers
+    f"{name} {own['compositing']}": lambda make=make, own=own: make(512, 512, **own)
+    for own in ({"compositing": "gather", "sensor": None}, {"compositing": "scatter", "sensor": None}, _OCCLUSION)
+    for name, make in (("capture", capture), ("gradient", gradient))
+}
 
 
 def serve() -> None:
@@ -184,7 +189,7 @@ def serve() -> None:
     for line in sys.stdin:
         name, path = line.rstrip("\n").split("|")
         if name not in known:
-            known[name] = (TIMED | EQUAL)[name]()
+            known[name] = (TIMED | EQUAL | LARGE)[name]()
             torch.manual_seed(3)
             torch.save(known[name](), path)
         start = time.process_time()
@@ -195,8 +200,8 @@ def serve() -> None:
 class Worker:
     """A process of a commit that runs cases when it is told to."""
 
-    def __init__(self, checkout: Path, compiler: str) -> None:
-        settings = {"CC": compiler, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(checkout)}
+    def __init__(self, checkout: Path, compiler: str, **more: str) -> None:
+        settings = {"CC": compiler, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(checkout), **more}
         command = [sys.executable, "-W", "ignore", str(Path(__file__).resolve()), "--serve", "-"]
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self.process = subprocess.Popen(command, cwd=checkout, env={**os.environ, **settings}, **pipes)

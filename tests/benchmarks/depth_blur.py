@@ -8,7 +8,6 @@ draw. The last line is a scene with many objects, whose tiles hold many depths.
 from __future__ import annotations
 
 import argparse
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -20,6 +19,7 @@ import torch
 
 from kornia_tidy.augmentation import RandomDepthBlur
 from kornia_tidy.data import dead_leaves, sample_scene
+from tests.benchmarks.rendering_against_peers import in_turn
 
 SIDE = 33  # pixels of the Gaussian blurs; the largest disc of RandomDepthBlur has as many
 
@@ -52,16 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     rounds = parser.parse_args(arguments).rounds
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    timed: dict[str, list[float]] = {}
-    called = calls()
+    torch.manual_seed(0)
     with torch.no_grad():
-        for turn in range(rounds + 1):  # the first one compiles
-            for name, call in called.items():
-                torch.manual_seed(turn)
-                start = time.thread_time()
-                call()
-                timed.setdefault(name, []).append(time.thread_time() - start)
-    medians = {name: 1e3 * statistics.median(times[1:]) for name, times in timed.items()}
+        medians = in_turn(calls(), rounds, time.thread_time)
     for name, median in medians.items():
         print(f"{name:34} {median:7.1f} ms")
     return medians

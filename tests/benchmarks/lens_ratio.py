@@ -20,6 +20,7 @@ from kornia_tidy.psf import FieldBank
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.dispatch import Rendering, render_layers
 from kornia_tidy.render.over_field import render_over_field
+from tests.benchmarks.rendering_against_peers import in_turn
 
 WINDOWS = (23, 61)
 LENS = "single-50mm"
@@ -80,14 +81,8 @@ def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) ->
 
 
 def least_times(rounds: int, actions: Sequence[Callable[[], object]]) -> list[float]:
-    """Return the least processor time of each action; they take turns."""
-    times: list[list[float]] = [[] for _ in actions]
-    for _ in range(rounds):
-        for own, action in zip(times, actions, strict=True):
-            start = time.process_time()
-            action()
-            own.append(time.process_time() - start)
-    return [min(own) for own in times]
+    """Return the least processor time of each action in seconds; they take turns."""
+    return [1e-3 * least for least in in_turn(dict(enumerate(actions)), rounds, time.process_time, min).values()]
 
 
 if __name__ == "__main__":

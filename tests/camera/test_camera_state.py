@@ -172,40 +172,20 @@ class TestTheSameCamera(BaseTester):
 
 
 OTHERS = [
-    (
-        "camera",
-        {"camera": ThinLensCamera(pixel_pitch=9e-6)},
-        r"camera.pixel_pitch is 9e-06 in the state and 8e-06 here",
-    ),
+    ("camera", {"camera": ThinLensCamera(pixel_pitch=9e-6)}, "pixel_pitch is 9e-06 in the state and 8e-06 here"),
     ("no depths", {"camera": DefocusRange()}, "camera is a DefocusRange in the state and a ThinLensCamera here"),
-    (
-        "depths",
-        {"camera": ThinLensCamera(depth_range=(0.4, math.inf))},
-        r"depth_range is \[0.4, inf\] in the state and",
-    ),
-    (
-        "focus",
-        {"camera": ThinLensCamera(focus_distance=torch.tensor(0.595))},
-        "camera.focus_distance is not set in the state and 0.595 here",
-    ),
+    ("depths", {"camera": ThinLensCamera(depth_range=(0.4, math.inf))}, r"depth_range is \[0.4, inf\] in the state"),
+    ("focus", {"camera": ThinLensCamera(focus_distance=torch.tensor(0.595))}, "focus_distance is not set in the"),
     ("modulator", {"modulator": Switching(4e-3)}, "modulator is a Switching in the state and a DwellTimes here"),
     ("dwell", {"modulator": DwellTimes((3, 1))}, r"modulator.shares is \[0.75, 0.25\] in the state and None here"),
     ("sensor", {"sensor": SensorNoise(0.02)}, "sensor.sigma is 0.02 in the state and 0.01 here"),
     ("no sensor", {"sensor": None}, "sensor is None in the state and a SensorNoise here"),
     ("fidelity", {"fidelity": "balanced"}, r"fidelity.pixel_tolerance is 0.01 in the state and 0.1 here"),
-    (
-        "spectrum",
-        {"spectrum": Spectrum((6e-7, 5e-7, 4e-7), torch.eye(3).tolist())},
-        r"spectrum.wavelengths is \[6e-07, ",
-    ),
+    ("spectrum", {"spectrum": Spectrum((6e-7, 5e-7, 4e-7), torch.eye(3).tolist())}, r"wavelengths is \[6e-07, "),
     ("compositing", {"compositing": "scatter"}, "compositing is 'scatter' in the state and 'gather' here"),
     ("colour", {"color_space": "linear"}, "color_space is 'linear' in the state and 'srgb' here"),
     ("border", {"border": "zero"}, "border is 'zero' in the state and 'reflect' here"),
-    (
-        "aperture",
-        {"aperture": 0.9 * circular_aperture(23, 0.12)},
-        r"aperture is a tensor of shape \(23, 23\) .* and None here",
-    ),
+    ("aperture", {"aperture": 0.9 * circular_aperture(23, 0.12)}, "aperture is a tensor .* and None here"),
     ("family", {"masks": RadialMask(2)}, "masks is a RadialMask in the state and a PixelwiseMask here"),
     ("limits", {"masks": PixelwiseMask(2, constraint="clamp")}, "constraint is 'clamp' in the state and 'none' here"),
     ("material", {"masks": PixelwiseMask(2, material=FUSED_SILICA)}, r"masks.material.dispersion is "),
@@ -254,9 +234,7 @@ class TestAnotherCamera(BaseTester):
         small().load_state_dict(optics.state_dict())
 
     def test_exception_nothing_to_take_over(self):
-        with pytest.raises(
-            ValueError, match=r"no settings to take over: the state has no entry '_extra_state', only x"
-        ):
+        with pytest.raises(ValueError, match=r"no settings to take over: the state has no entry .*, only x"):
             small().load_state_dict({"x": torch.ones(1)}, take_over=True)
 
     @pytest.mark.parametrize(

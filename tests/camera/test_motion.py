@@ -43,13 +43,9 @@ class TestMovingCapture(BaseTester):
     def test_exception(self):
         optics = camera()
         images, depths = at_rest(optics, *scene())
-        with pytest.raises(
-            ValueError, match="images must have one scene for each of the 3 moments of the exposure, got 2"
-        ):
+        with pytest.raises(ValueError, match=r"images must have one scene for each of the 3 moments .*, got 2"):
             moving_capture(optics, images[:, :2], depths)
-        with pytest.raises(
-            ValueError, match="depths must have one scene for each of the 3 moments of the exposure, got 1"
-        ):
+        with pytest.raises(ValueError, match=r"depths must have one scene for each of the 3 moments .*, got 1"):
             moving_capture(optics, images, depths[:, :1])
         with pytest.raises(ValueError, match="one scene for each of the 5 moments of the exposure, got 3"):
             moving_capture(camera(modulator=Switching(4e-3)), images, depths)
@@ -190,11 +186,7 @@ class TestScenes(BaseTester):
         ("make", "motion", "sentence"),
         [
             (scenes_by_homography, torch.eye(3), r"homographies must have shape \(M, 3, 3\) or \(B, M, 3, 3\), got"),
-            (
-                scenes_by_flow,
-                torch.zeros(1, 2, 5, 5),
-                r"flows must have shape \(M, 2, 26, 22\) or .* got \(1, 2, 5, 5\)",
-            ),
+            (scenes_by_flow, torch.zeros(1, 2, 5, 5), r"\(M, 2, 26, 22\) or .* got \(1, 2, 5, 5\)"),
             (scenes_by_homography, torch.eye(3).repeat(3, 1, 1, 1), "motion must be that of 2 images, got 3"),
         ],
     )

@@ -92,9 +92,7 @@ class TestRGBDFolder(BaseTester):
             write(tmp_path, f"rgb/{name}.png", f"depth/{name}.png", 1)
         (tmp_path / "depth/b.png").unlink()
         (tmp_path / "rgb/d.png").unlink()
-        with pytest.raises(
-            ValueError, match=r"2 files in .* have no partner by 'rgb/\*\.png' .*: depth/d.png, rgb/b.png$"
-        ):
+        with pytest.raises(ValueError, match=r"2 files in .* have no partner by 'rgb/\*\.png' .*: depth/d.png"):
             RGBDFolder(tmp_path, "rgb/*.png", "depth/*.png")
         for name in ("a", "e"):
             (tmp_path / f"depth/{name}.png").unlink()
@@ -170,10 +168,7 @@ class TestDescribedFolder(BaseTester):
             ('{"image": "*.png", "depth": "*_d.png", "invalid": 5}', "invalid must be a list of numbers, got 5"),
             ('{"image": "*.png", "depth": "*_d.png", "invalid": [null]}', "invalid must be a list of numbers"),
             ('{"image": "*.png", "depth": "*_d.png", "scale": true}', "scale must be a number, got True"),
-            (
-                '{"image": "*.png", "depth": "*_d.png", "scale": 1' + "0" * 400 + "}",
-                "must have at most 300 digits, got 401",
-            ),
+            ('{"image": "*.png", "depth": "*_d.png", "scale": 1' + "0" * 400 + "}", "at most 300 digits, got 401"),
             ("[" * 100_000, "cannot read .*rgbd.json: its JSON is nested deeper than 100 levels"),
             ('{"image": "*.png", "depth": "*_d.png", "scale": -1}', "scale must be positive"),
         ],

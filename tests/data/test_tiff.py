@@ -132,9 +132,7 @@ class TestMissingValues(BaseTester):
         DEPTH.fields[42112] = 2, xml
         (tmp_path / "a.tif").write_bytes(tiff(DEPTH))
         read_depth(tmp_path / "a.tif", 0.001)
-        with pytest.warns(
-            UserWarning, match=r"a\.tif says that its numbers are to be multiplied by 0.001, and scale is 1"
-        ):
+        with pytest.warns(UserWarning, match=r"its numbers are to be multiplied by 0.001, and scale is 1"):
             read_depth(tmp_path / "a.tif")
         del DEPTH.fields[42112]
 
@@ -166,10 +164,7 @@ class TestRefused(BaseTester):
             ({"fields": {33629: (5, [1, 1] * 30)}}, "it holds 30 pictures"),  # MetaMorph
             ({"fields": {50706: (1, [1, 4, 0, 0])}}, r"it is a camera raw file \(DNG\): .* kornia-tidy raw develop"),
             ({"fields": {33422: (1, [0, 1, 1, 2])}}, "it is a camera raw file"),
-            (
-                {"photometric": 1, "fields": {338: (3, [2] * 999)}},
-                "3 samples a pixel .* and ExtraSamples 2, 2, 2: save",
-            ),
+            ({"photometric": 1, "fields": {338: (3, [2] * 999)}}, "3 samples a pixel .* and ExtraSamples 2, 2, 2"),
             ({"compression": 34712}, r"its compression is 34712 \(JPEG2000\), not read"),
             ({"fields": {262: (3, [5])}}, r"pixels is not read \(photometric interpretation 5, SEPARATED\)"),
             ({"fields": {262: (3, [6])}}, r"its pixels are YCbCr \(photometric interpretation 6\)"),

@@ -93,7 +93,5 @@ class TestRealLens(BaseTester):
     def test_exception(self):
         with pytest.raises(ValueError, match="name of a lens must be one of"):
             DesignTask(lens="sonnar")
-        with pytest.raises(
-            ValueError, match=r"focal_length must be that of the lens 'single-50mm', 0\.05 m, got 0\.035 m"
-        ):
+        with pytest.raises(ValueError, match=r"focal_length must be that of the lens .*, 0\.05 m, got 0\.035 m"):
             DesignTask(lens="single-50mm", focal_length=0.035)

@@ -167,10 +167,7 @@ class TestWithMeasurements(BaseTester):
             ({"focal_length": 35e-3}, "a focal length of 0.05 m, and the network is for 0.035 m"),
             ({"focus_distance": 1.0}, "a focus distance of 0.595 m, and the network is for 1 m"),
             ({"focus_distance": float("inf")}, "the network is for inf m"),
-            (
-                {"depth_range": (0.3, 2.5)},
-                "measured from 0.4 to 2.5 m, and the network is for depths from 0.3 to 2.5 m",
-            ),
+            ({"depth_range": (0.3, 2.5)}, "from 0.4 to 2.5 m, and the network is for depths from 0.3 to 2.5 m"),
             ({"depth_range": (0.4, float("inf"))}, "depths from 0.4 to inf m"),
         ):
             with pytest.raises(ValueError, match=sentence):

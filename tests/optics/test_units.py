@@ -246,7 +246,7 @@ class TestLens(BaseTester):
         [
             (
                 {"focal_length": 50, "aperture_diameter": 2.8, "focus_distance": 600},
-                "focal_length must be metres between 1e-05 and 10 .50 mm is 50e-3., got 50",
+                "between 1e-05 and 10 .50 mm is 50e-3., got 50",
             ),
             ({"aperture_diameter": 2.8}, "aperture_diameter must be at most 0.1 m, which is f/0.5, .*got 2.8"),
             ({"aperture_diameter": 28}, "aperture_diameter must be metres between"),

@@ -90,19 +90,16 @@ class TestLearnableAperture(BaseTester):
         with pytest.raises(ValueError, match="and be finite, got amplitudes up to nan"):
             optics(*scene())
 
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_one_for_all_masks_is_the_given_aperture(self, compositing):
+    @pytest.mark.parametrize(
+        ("made", "compositing"),
+        [(camera, "gather"), (camera, "scatter"), (camera, "occlusion"), (through_a_lens, "gather")],
+    )
+    def test_feature_one_for_all_masks_is_the_given_aperture(self, made, compositing):
         amplitude = apertures(1)[0].detach()
-        learnt, given = camera(nn.Parameter(amplitude), compositing=compositing), camera(amplitude)
-        given.compositing = compositing
-        self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
-        same = camera(nn.Parameter(amplitude.expand(3, 23, 23).clone()), compositing=compositing)
-        self.assert_close(same(*scene()), given(*scene()), rtol=0, atol=1e-6)
-
-    def test_feature_behind_a_lens_it_is_the_given_aperture(self):
-        amplitude = apertures(1)[0].detach()
-        learnt, given = through_a_lens(nn.Parameter(amplitude)), through_a_lens(amplitude)
-        self.assert_close(learnt(*scene()), given(*scene()), rtol=0, atol=1e-6)
+        given = made(amplitude, compositing=compositing)
+        for learnt in (amplitude, amplitude.expand(3, 23, 23).clone()):
+            found = made(nn.Parameter(learnt), compositing=compositing)
+            self.assert_close(found(*scene()), given(*scene()), rtol=0, atol=1e-6)
 
     def test_feature_behind_a_lens_captures_follow_it(self):
         """Whatever was captured before, with gradients and without, a capture is that of a new camera."""
@@ -141,36 +138,40 @@ class TestLearnableAperture(BaseTester):
             learnt = camera(nn.Parameter(amplitude.expand(shape).clone()), **options)
             self.assert_close(learnt.psf_bank().psfs, camera(amplitude, **options).psf_bank().psfs)
 
-    @pytest.mark.parametrize("learnt", [False, True])
+    @pytest.mark.parametrize(("made", "learnt"), [(camera, True), (through_a_lens, True), (through_a_lens, False)])
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_masks_behind_a_lens_count_by_the_light_that_passes_its_stop(self, compositing, learnt):
-        """As the next test; a cell that the stop cuts counts by its open part."""
+    @torch.no_grad()
+    def test_feature_masks_count_by_the_light_that_passes(self, compositing, made, learnt):
+        """The exposure is the mean of captures through each mask with its aperture, weighted by time and light.
+
+        Behind a lens a cell that its stop cuts counts by its open part.
+        """
         amplitude, times = apertures(), torch.tensor([0.25, 0.5, 0.25])
-        with torch.no_grad():
-            amplitude[1, :12] *= 0.5
-        modulator = DwellTimes((1, 2, 1))
+        amplitude[1, :12] *= 0.5
+        # Each PSF scaled to one would not be their average scaled.
         options = {"compositing": compositing, "fidelity": SMALL.replace(stray_light="discard")}
-        given = amplitude if learnt else amplitude.detach()
-        optics = through_a_lens(given, modulator=modulator, **options)
-        disc = circular_aperture(23, 0.1, edges="area").double()
-        light = (amplitude.detach().double().square() * disc).sum((1, 2)) * times
+        optics = made(amplitude if learnt else amplitude.detach(), modulator=DwellTimes((1, 2, 1)), **options)
+        stop = 1.0 if made is camera else circular_aperture(23, 0.1, edges="area").double()
+        light = (amplitude.double().square() * stop).sum((1, 2)) * times
         light = (light / light.sum()).float()
         self.assert_close(optics.state_weights(torch.float32), light, rtol=1e-4, atol=0)
         captures = []
-        with torch.no_grad():
-            for k, height in enumerate(optics.masks.heights()):
-                alone = through_a_lens(amplitude[k].detach(), **options)
-                alone.masks = PixelwiseMask(1, initial=height[None])
-                captures.append(alone(*scene()))
-                self.assert_close(optics.through_state(k)(*scene()), captures[k], rtol=0, atol=2e-6)
-            expected = sum(share * capture for share, capture in zip(light, captures, strict=True))
-            self.assert_close(optics(*scene()), expected, rtol=0, atol=2e-5)
-            image, depth = (part[:, None].repeat(1, 3, 1, 1, 1) for part in scene())
-            self.assert_close(moving_capture(optics, image, depth), expected, rtol=0, atol=2e-5)
-            self.assert_close(burst(optics, *scene()).sum(1), expected, rtol=0, atol=2e-5)
-            made = camera_of_state(optics.state_dict())
-            made.field_center = optics.field_center
-            self.assert_close(made(*scene()), optics(*scene()), rtol=0, atol=1e-6)
+        for k, height in enumerate(optics.masks.heights()):
+            alone = made(amplitude[k].detach(), **options)
+            alone.masks = PixelwiseMask(1, initial=height[None])
+            captures.append(alone(*scene()))
+            self.assert_close(optics.through_state(k)(*scene()), captures[k], rtol=0, atol=2e-6)
+        expected, atol = (
+            (light[:, None, None, None, None] * torch.stack(captures)).sum(0),
+            2e-6 if made is camera else 2e-5,
+        )
+        self.assert_close(optics(*scene()), expected, rtol=0, atol=atol)
+        image, depth = (part[:, None].repeat(1, 3, 1, 1, 1) for part in scene())
+        self.assert_close(moving_capture(optics, image, depth), expected, rtol=0, atol=atol)
+        self.assert_close(burst(optics, *scene()).sum(1), expected, rtol=0, atol=atol)
+        again = camera_of_state(optics.state_dict())
+        again.field_center = optics.field_center
+        self.assert_close(again(*scene()), optics(*scene()), rtol=0, atol=1e-6)
 
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_gradcheck_of_amplitudes_behind_a_lens(self, compositing):
@@ -196,33 +197,6 @@ class TestLearnableAperture(BaseTester):
         self.assert_close(camera(amplitude)(*scene()), camera(amplitude.detach())(*scene()), rtol=0, atol=1e-6)
         given = camera(amplitude.detach())
         assert torch.equal(camera_of_state(given.state_dict())(*scene()), given(*scene()))
-
-    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
-    def test_feature_masks_count_by_the_light_that_passes(self, compositing):
-        """The exposure is the mean of captures through each mask with its aperture, weighted by time and light."""
-        amplitude, times = apertures(), (1, 2, 1)
-        with torch.no_grad():
-            amplitude[1] *= 0.5
-        fidelity = SMALL.replace(stray_light="discard")  # each PSF scaled to one would not be their average scaled
-        optics = camera(amplitude, compositing=compositing, modulator=DwellTimes(times), fidelity=fidelity)
-        light = amplitude.detach().square().sum((1, 2)) * torch.tensor(times)
-        captures = []
-        for k, height in enumerate(optics.masks.heights().detach()):
-            alone = TiDyOptics(
-                PixelwiseMask(initial=height),
-                aperture=amplitude[k].detach(),
-                compositing=compositing,
-                sensor=None,
-                color_space="linear",
-                fidelity=fidelity,
-            )
-            captures.append(alone(*scene()))
-            self.assert_close(optics.through_state(k)(*scene()), captures[k], rtol=0, atol=2e-6)
-        expected = sum(share * capture for share, capture in zip(light / light.sum(), captures, strict=True))
-        self.assert_close(optics(*scene()), expected, rtol=0, atol=2e-6)
-        image, depth = (part[:, None].repeat(1, 3, 1, 1, 1) for part in scene())
-        self.assert_close(moving_capture(optics, image, depth), expected, rtol=0, atol=2e-6)
-        self.assert_close(burst(optics, *scene()).sum(1), expected, rtol=0, atol=2e-6)
 
     def test_feature_it_is_a_parameter_of_the_camera(self):
         amplitude = apertures()

@@ -152,13 +152,7 @@ class TestMeasuredField(BaseTester):
     @pytest.mark.parametrize(
         ("banks", "field", "light", "error", "message"),
         [
-            (
-                2,
-                [(0, 0)],
-                None,
-                ValueError,
-                "own place and light, got 2 banks, 1 different places and 1 values of light",
-            ),
+            (2, [(0, 0)], None, ValueError, "got 2 banks, 1 different places and 1 values of light"),
             (2, [(0, 0), (0, 0)], None, ValueError, "2 banks, 1 different places"),
             (2, [(0, 0), (0, 9)], [1.0], ValueError, "and 1 values of light"),
             (2, [(0, 0), (0, 9)], [1.0, -1.0], ValueError, r"light must be positive, got \[1.0, -1.0\]"),

@@ -73,9 +73,7 @@ class TestLosses(BaseTester):
 
     def test_exception_an_empty_mask(self, loss, device):
         maps = torch.zeros(2, 1, 4, 5, device=device)
-        with pytest.raises(
-            ValueError, match=r"at least one valid (pixel|pair of pixels beside each other), got a mask .* with none"
-        ):
+        with pytest.raises(ValueError, match=r"at least one valid (pixel|pair of pixels .*), got a mask .* with none"):
             loss(maps, maps, torch.zeros(2, 1, 4, 5, dtype=torch.bool, device=device))
 
     def test_dynamo_one_graph_and_an_empty_mask_has_no_loss(self, loss, device):

@@ -99,10 +99,7 @@ class TestLoadMiDaSSmall(BaseTester):
     @pytest.mark.parametrize(
         ("damage", "sentence"),
         [
-            (
-                lambda s: s.pop("scratch.layer1_rn.weight"),
-                "1 of 482 weights are missing, first scratch.layer1_rn.weight",
-            ),
+            (lambda s: s.pop("scratch.layer1_rn.weight"), "1 of 482 weights are missing, first scratch.layer1_rn"),
             (lambda s: s.update(more=torch.zeros(1)), "1 weights are unknown, first more"),
             (
                 lambda s: s.update({"scratch.layer1_rn.weight": torch.zeros(64, 32, 1, 1)}),

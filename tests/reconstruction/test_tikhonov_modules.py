@@ -63,9 +63,7 @@ class TestModules(BaseTester):
 
     def test_exception_of_the_functions(self, device):
         capture, psfs = torch.rand(1, 2, 8, 8, device=device), make_psfs(device=device)
-        with pytest.raises(
-            ValueError, match=r"\(..., 1, P, P\) with P odd for a capture of 1 channels, got \(3, 2, 5, 5\)"
-        ):
+        with pytest.raises(ValueError, match=r"\(..., 1, P, P\) with P odd .* 1 channels, got \(3, 2, 5, 5\)"):
             tikhonov_layers(capture[:, :1], psfs, 1.0)
         with pytest.raises(ValueError, match=r"P odd .* got \(3, 2, 4, 4\)"):
             tikhonov_layers(capture, psfs[..., 1:, 1:], 1.0)

@@ -213,9 +213,7 @@ class TestReconstructTiled(BaseTester):
             def forward(self, image):
                 return image - self.far(image)
 
-        with pytest.raises(
-            ValueError, match="the head cannot be tiled: each of its outputs depends on pixels more than"
-        ):
+        with pytest.raises(ValueError, match="cannot be tiled: each of its outputs depends on pixels more than"):
             reconstruct_tiled(Global().eval(), torch.rand(1, 3, 20, 20), tile=16)
 
     def test_exception_a_head_that_knows_the_place(self):
@@ -242,9 +240,7 @@ class TestReconstructTiled(BaseTester):
 
     def test_exception_names_what_is_too_small(self):
         head, image = trained("attention"), torch.rand(1, 3, 600, 600)
-        with pytest.raises(
-            ValueError, match="a tile must have at least 240 x 240 pixels for an overlap of 112 at each cut, got 200"
-        ):
+        with pytest.raises(ValueError, match="at least 240 x 240 pixels for an overlap of 112 at each cut, got 200"):
             reconstruct_tiled(head, image, tile=200)
         with pytest.raises(ValueError, match="the smallest tile of this head, 240 x 240 pixels, takes 31 MiB, memory_"):
             reconstruct_tiled(head, image, memory_budget=1 << 20)

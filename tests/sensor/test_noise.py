@@ -93,9 +93,7 @@ class TestSensorNoise(BaseTester):
         params = sensor.draw(image.shape, device=device)
         with pytest.raises(ValueError, match=r"params must hold the field 'shot' .* got \['read'\]"):
             sensor(image, {"read": params["read"]})
-        with pytest.raises(
-            ValueError, match=r"params\['read'\] must have the image's shape \(1, 3, 4, 4\), got \(3, 4, 4\)"
-        ):
+        with pytest.raises(ValueError, match=r"params\['read'\] must have the image's shape .*, got \(3, 4, 4\)"):
             sensor(image, {**params, "read": params["read"][0]})
         with pytest.raises(ValueError, match="got both"):
             sensor(image, params, torch.Generator())

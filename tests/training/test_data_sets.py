@@ -199,10 +199,7 @@ class TestMakeScenes(BaseTester):
         assert len(make_scenes(settings, "all")) == 2
 
     def test_exception_names_the_bad_value(self, roots):
-        with pytest.raises(
-            ValueError,
-            match="data must be one of 'photographic-leaves', 'dead-leaves', 'photo-collages', 'flying-things'",
-        ):
+        with pytest.raises(ValueError, match=r"data must be one of 'photographic-leaves', .*, got 'kitti'"):
             make_scenes(TrainingSettings(data="kitti"), "train")
         with pytest.raises(ValueError, match="split must be one of 'train', 'validation', 'test', got 'all'"):
             make_scenes(settings_of("nyu", roots), "all")

@@ -11,7 +11,6 @@ from kornia_tidy.data import photographs_in
 from kornia_tidy.reconstruction.any_camera import WEIGHTS
 from tests.benchmarks.any_camera.cameras import POOLS
 from tests.benchmarks.any_camera.captures import photograph, photograph_collages, photograph_pictures
-from tests.benchmarks.any_camera.closed_form import sweep
 from tests.benchmarks.any_camera.guards import measure
 from tests.benchmarks.any_camera.scores import averaged, first_weights, mixed, score_pool
 from tests.benchmarks.any_camera.training import ship, train
@@ -20,7 +19,7 @@ from tests.benchmarks.any_camera.training import ship, train
 def main() -> None:
     """Run one step."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("step", choices=("photograph", "sweep", "train", "closed-forms", "score", "guards", "ship"))
+    parser.add_argument("step", choices=("photograph", "train", "closed-forms", "score", "guards", "ship"))
     parser.add_argument("folder", type=Path, help="of captures, checkpoints and scores; a step goes on where it ended")
     parser.add_argument("--pool", choices=tuple(POOLS), default="training")
     parser.add_argument("--photographs", type=Path, help="folder, for collages and whole ones")
@@ -35,8 +34,6 @@ def main() -> None:
             photographs = photographs_in(options.photographs)
             photograph_collages(options.folder / "captures", photographs)
             photograph_pictures(options.folder / "captures", photographs)
-    elif options.step == "sweep":
-        sweep(options.folder, options.pool)
     elif options.step == "train":
         train(options.folder, options.steps)
     elif options.step == "guards":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,53 +70,39 @@ def photographed(optics: TiDyOptics, image: Tensor, inverse_depth: Tensor) -> Te
 
 def stored(folder: Path, name: str, scenes: int | None = None) -> Captures:
     """Return the captures of a camera, which are made if they are not in the folder."""
-    light, image = (folder / f"{name}-{part}.npy" for part in ("light", "image"))
-    if not light.exists():
-        count = scenes or (SCENES_OF_SHIPPED if name in SHIPPED else SCENES)
-        optics = camera(name)
-        seen, shown = [], []
-        for index in range(count):
-            scene, near = painted_scene(keyed_seed(f"{name} scenes", index))
-            seen.append(photographed(optics, scene, near))
-            shown.append(rgb_to_linear_rgb(scene[None])[0])
-        folder.mkdir(parents=True, exist_ok=True)
-        _write({image: shown, light: seen})
-    return Captures(np.load(light, mmap_mode="r"), np.load(image, mmap_mode="r"))
+    count = scenes or (SCENES_OF_SHIPPED if name in SHIPPED else SCENES)
+    _make(folder, name, name, (painted_scene(keyed_seed(f"{name} scenes", index)) for index in range(count)))
+    light, image = (np.load(folder / f"{name}-{part}.npy", mmap_mode="r") for part in ("light", "image"))
+    return Captures(light, image)
 
 
 def photograph_collages(folder: Path, photographs: Sequence[str], scenes: int = 10) -> None:
     """Make captures of collages of photographs by the cameras of training; of the shipped ones more."""
+
+    def collage(seed: int) -> tuple[Tensor, Tensor]:
+        scene, depth = photo_collage(photographs, SIDE, SIDE, depth_range=(1.0, float("inf")), seed=seed)
+        return scene, 1 / depth
+
     for name in pool_names("training"):
-        light, image = (folder / f"{name}-collages-{part}.npy" for part in ("light", "image"))
-        if light.exists():
-            continue
-        optics, seen, shown = camera(name), [], []
-        for index in range(3 * scenes if name in SHIPPED else scenes):
-            seed = keyed_seed(f"{name} collages", index)
-            scene, depth = photo_collage(photographs, SIDE, SIDE, depth_range=(1.0, float("inf")), seed=seed)
-            seen.append(photographed(optics, scene, 1 / depth))
-            shown.append(rgb_to_linear_rgb(scene[None])[0])
-        _write({image: shown, light: seen})
+        count = 3 * scenes if name in SHIPPED else scenes
+        own = (collage(keyed_seed(f"{name} collages", index)) for index in range(count))
+        _make(folder, f"{name}-collages", name, own)
 
 
 def photograph_pictures(folder: Path, photographs: Sequence[Path]) -> None:
     """Make captures of whole photographs by the cameras of training, those of shipped systems first; of these more."""
+
+    def picture(kind: str, index: int, seed: int) -> tuple[Tensor, Tensor]:
+        scene, near = pictured_scene(photographs, seed)
+        return magnified(scene, seed) if kind == "more" and index % SOFT == SOFT - 1 else scene, near
+
     names = pool_names("training")
     ordered = [*SHIPPED, *(one for first in range(STRIDE) for one in names[len(SHIPPED) + first :: STRIDE])]
     for kind, (scenes, of_shipped) in PICTURES.items():
         for name in ordered:
-            light, image = (folder / f"{name}-{kind}-{part}.npy" for part in ("light", "image"))
-            if light.exists():
-                continue
-            optics, seen, shown = camera(name), [], []
-            for index in range(of_shipped if name in SHIPPED else scenes):
-                seed = keyed_seed(f"{name} {kind}", index)
-                scene, near = pictured_scene(photographs, seed)
-                if kind == "more" and index % SOFT == SOFT - 1:
-                    scene = magnified(scene, seed)
-                seen.append(photographed(optics, scene, near))
-                shown.append(rgb_to_linear_rgb(scene[None])[0])
-            _write({image: shown, light: seen})
+            count = of_shipped if name in SHIPPED else scenes
+            own = (picture(kind, index, keyed_seed(f"{name} {kind}", index)) for index in range(count))
+            _make(folder, f"{name}-{kind}", name, own)
             print(name, kind, flush=True)
 
 
@@ -151,9 +137,20 @@ def pictured_scene(photographs: Sequence[Path], seed: int, side: int = SIDE) -> 
     return image, torch.from_numpy((first + (last - first) * place)[None].astype(np.float32))
 
 
-def _write(parts: Mapping[Path, list[Tensor]]) -> None:
-    """Write pictures in linear light, so that no file is half there."""
-    for path, part in parts.items():
+def _make(folder: Path, title: str, name: str, scenes: Iterable[tuple[Tensor, Tensor]]) -> None:
+    """Write a camera's captures of scenes, and the scenes, in linear light; those in the folder are kept.
+
+    A file is moved to its place once it is whole.
+    """
+    light, image = (folder / f"{title}-{part}.npy" for part in ("light", "image"))
+    if light.exists():
+        return
+    optics, seen, shown = camera(name), [], []
+    for scene, near in scenes:
+        seen.append(photographed(optics, scene, near))
+        shown.append(rgb_to_linear_rgb(scene[None])[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, part in ((image, shown), (light, seen)):
         values = (torch.stack(part) * LEVELS).round().numpy().astype(np.uint16)
         with open(partial := path.with_suffix(".partial"), "wb") as file:
             np.save(file, values)

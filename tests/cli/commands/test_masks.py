@@ -106,10 +106,7 @@ class TestMasks(BaseTester):
             ("export heights.npy -o taken --force", "it holds holiday.jpg, which is no file of a folder of frames"),
             ("export heights.npy -o heights.npy --force", "cannot write heights.npy: it is the input"),
             ("export heights.npy -o slm --panel 0x5", "--panel must be WIDTHxHEIGHT in pixels"),
-            (
-                "export heights.npy -o slm --response turn.txt --bits 2",
-                "got 1 at level 2 (line 3) after 2: smooth noise",
-            ),
+            ("export heights.npy -o slm --response turn.txt --bits 2", "got 1 at level 2 (line 3) after 2: smooth"),
             ("export heights.npy -o slm --dwell 1 2 3", "there are 3 dwell shares for 2 masks"),
             ("import taken", "cannot read taken/frames.json: there is no such file"),
             ("import taken -o x.stl", "the suffix of what to write must be one of '.npy', '.safetensors'"),

@@ -148,7 +148,5 @@ class TestReadResponse(BaseTester):
     @pytest.mark.parametrize("unit", [math.pi, 2 * math.pi])
     def test_feature_units_that_no_header_names_are_told(self, unit, tmp_path):
         (tmp_path / "lut.csv").write_text("\n".join(f"{g},{p / unit:.5f}" for g, p in enumerate(PLAIN)))
-        with pytest.warns(
-            UserWarning, match=r"spans [12]\.\d+ rad, read as radians: .*header, such as 'phase \(deg\)'"
-        ):
+        with pytest.warns(UserWarning, match=r"spans [12]\.\d+ rad, read as radians: .*header, such as"):
             read_response(tmp_path / "lut.csv", 8)

@@ -211,10 +211,7 @@ class TestSamples(BaseTester):
     @pytest.mark.parametrize(
         ("extra", "sentence"),
         [
-            (
-                {259: (SHORT, [7]), 322: (LONG, [64]), 323: (LONG, [16])},
-                "its JPEG tiles of 64 pixels are wider than its",
-            ),
+            ({259: (SHORT, [7]), 322: (LONG, [64]), 323: (LONG, [16])}, "its JPEG tiles of 64 pixels are wider"),
             ({259: (SHORT, [34892])}, "its lossy JPEG is not of the kind that can be linearised"),
             ({259: (SHORT, [8]), 317: (SHORT, [3])}, "its Predictor 3 does not belong to its integer samples of 16"),
             ({258: (SHORT, [8]), 322: (LONG, [0]), 323: (LONG, [16])}, "its tiles have 0 x 16 pixels"),

@@ -250,9 +250,7 @@ class TestLens(BaseTester):
     def test_feature_beyond_its_range_its_edge_stands_in_and_it_warns(self):
         lens = Lens.from_seidel(50e-3, 8.0, 1.0, 10e-3, coma=1.0)
         x, y = torch.tensor([0.3]).double(), torch.tensor([0.5]).double()
-        with pytest.warns(
-            LensRangeWarning, match=r"a field of 0.02 m beyond 0.01 m, and the edge of its table stands in"
-        ):
+        with pytest.warns(LensRangeWarning, match=r"a field of 0.02 m beyond 0.01 m, and the edge of its table"):
             beyond = path(lens, 20e-3, 0.0, x, y)
         self.assert_close(beyond, path(lens, 10e-3, 0.0, x, y))
         with pytest.warns(LensRangeWarning, match=r"a defocus of 1000 rad beyond .* and a wavelength of 800 nm beyond"):
@@ -279,10 +277,7 @@ class TestLens(BaseTester):
     @pytest.mark.parametrize(
         ("call", "message"),
         [
-            (
-                lambda: Lens.named("sonnar", 8.0, 0.5),
-                "name of a lens must be one of 'double-gauss-50mm', .*, got 'sonnar'",
-            ),
+            (lambda: Lens.named("sonnar", 8.0, 0.5), "must be one of 'double-gauss-50mm', .*, got 'sonnar'"),
             (lambda: Lens.named("single-50mm", 0.3, 0.5), "f_number must be at least 0.5, got 0.3"),
             (lambda: Lens.named("single-50mm", -1, 0.5), "f_number must be positive and finite, got -1"),
             (lambda: Lens.named("single-50mm", 8, 0.03), "focus_distance must be one that the lens brings to a sensor"),
@@ -290,22 +285,13 @@ class TestLens(BaseTester):
             (lambda: Lens.named("single-50mm", 8, 0.5, wavelengths=(530,)), "wavelengths must be metres between"),
             (lambda: Lens.named("single-50mm", 8, 0.5, field=6.8), "field must be metres between 1e-06 and 1"),
             (lambda: Lens.named("single-50mm", 8, 0.5, field=0.2), "no ray through the stop at .* reaches the sensor"),
-            (
-                lambda: Lens.from_prescription(plano_convex(), 8.0, 0.5),
-                "field must be the largest height on the sensor",
-            ),
-            (
-                lambda: Lens.from_prescription(plano_convex(25.0), 8.0, 0.5, field=0),
-                "millimetres, give it 'unit': 'mm'",
-            ),
+            (lambda: Lens.from_prescription(plano_convex(), 8.0, 0.5), "field must be the largest height on"),
+            (lambda: Lens.from_prescription(plano_convex(25.0), 8.0, 0.5, field=0), "give it 'unit': 'mm'"),
             (lambda: Lens.from_prescription(plano_convex(index={"powers": [[-2, 0]]}), 8.0, 0.5, field=0), "gives nan"),
             (lambda: SEIDEL.distortion(torch.tensor([-1e-3])), "heights must be zero or positive metres .*-0.001"),
             (lambda: SEIDEL.relative_illumination(torch.zeros(2, 2)), "heights must be zero or positive metres"),
             (lambda: Lens.from_prescription(plano_convex(-25e-3), 8.0, 0.5, field=0), "the lens must collect light"),
-            (
-                lambda: Lens.from_seidel(50e-3, 8.0, 1.0, 1e-2, coma=math.nan),
-                "coma must be finite and below 1e6, got nan",
-            ),
+            (lambda: Lens.from_seidel(50e-3, 8.0, 1.0, 1e-2, coma=math.nan), "coma must be finite .*, got nan"),
             (lambda: Lens.from_seidel(50e-3, 8.0, 1.0, 1e-2, distortion=2), "distortion must be a part of 1"),
         ],
     )
