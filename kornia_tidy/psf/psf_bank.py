@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -11,7 +12,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_values
+from kornia_tidy.checks import check_choice, check_finite, check_number, check_values, described
 from kornia_tidy.files import write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
@@ -123,7 +124,7 @@ class BankOfPSFs:
             >>> bank.at_defocus([-3.0, 0.5, 1.0]).psfs.flatten()
             tensor([0.0000, 0.7500, 1.0000])
         """
-        wanted = torch.as_tensor(defocus, dtype=torch.float64, device=self.defocus.device)
+        wanted = torch.tensor(checked_nodes(defocus), dtype=torch.float64, device=self.defocus.device)
         nodes, depths = self.defocus.double(), len(self.axes) - 2
         upper = torch.searchsorted(nodes, wanted).clamp(1, max(len(nodes) - 1, 1)).clamp(max=len(nodes) - 1)
         lower = (upper - 1).clamp(min=0)
@@ -182,7 +183,8 @@ class BankOfPSFs:
 
         Raises:
             FileNotFoundError: if the file is missing.
-            ValueError: if the file is not such a bank, or a value is NaN or infinite.
+            ValueError: if the file is not such a bank, a value is NaN or infinite, the nodes do not ascend, or the PSFs
+                of one place are negative somewhere.
         """
         stored, notes = read_tensors(path, cls.words, device)
         found, tensors = notes.get("format"), {name: value for name, value in stored.items() if "." not in name}
@@ -192,9 +194,13 @@ class BankOfPSFs:
         for name, value in tensors.items():
             check_finite(f"{name} of {path}", value)
         try:
-            return cls(**tensors)
+            bank = cls(**tensors)
+            _check_ascending(bank.defocus)
+            if "field" not in names:  # between places that were measured, a thin plate may undershoot
+                _check_light("psfs", bank.psfs)
         except ValueError as error:
             raise ValueError(f"cannot read {path}: {error}") from None
+        return bank
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,15 +240,43 @@ class PSFBank(BankOfPSFs):
             ValueError: if a value is negative or not finite, a PSF holds no light, or the nodes do not ascend.
         """
         check_finite("defocus of measured psfs", defocus)
-        check_values("measured psfs", psfs)
-        if not bool((torch.isfinite(psfs) & (psfs >= 0)).all()):
-            raise ValueError(f"measured psfs must be finite and not negative, got a minimum of {float(psfs.min())}")
-        if not bool((defocus.diff() > 0).all()):
-            raise ValueError(f"defocus must ascend, got {defocus.tolist()}")
+        _check_light("measured psfs", psfs)
+        _check_ascending(defocus)
         total = psfs.sum((-2, -1))
         if not bool((total > 0).all()):
             raise ValueError("every measured psf must hold some light, got one that is all zero")
         return cls(psfs / total[..., None, None], defocus, torch.ones_like(total))
+
+
+def checked_nodes(defocus: Sequence[float]) -> tuple[float, ...]:
+    """Return nodes of defocus as plain numbers, or raise unless they are one or more finite numbers.
+
+    Example:
+        >>> checked_nodes(torch.tensor([-1.0, 2.5]))
+        (-1.0, 2.5)
+    """
+    listed: Any = defocus.tolist() if hasattr(defocus, "tolist") else defocus
+    if isinstance(listed, str) or not isinstance(listed, Iterable):
+        raise TypeError(f"defocus must be a list of nodes in radians, such as [-10.0, 10.0], got {described(listed)}")
+    nodes = list(listed)
+    for psi in nodes:
+        check_number("a node of defocus", psi, "radians")
+    if not nodes or not all(math.isfinite(psi) for psi in nodes):
+        raise ValueError(f"defocus must be one or more nodes in finite radians, got {nodes!r:.80}")
+    return tuple(float(psi) for psi in nodes)
+
+
+def _check_ascending(defocus: Tensor) -> None:
+    """Raise ``ValueError`` unless nodes of defocus ascend."""
+    if not bool((defocus.diff() > 0).all()):
+        raise ValueError(f"defocus must ascend, got {defocus.tolist()!r:.200}")
+
+
+def _check_light(name: str, psfs: Tensor) -> None:
+    """Raise ``ValueError`` unless PSFs are light: finite and not negative."""
+    check_values(name, psfs)
+    if not bool((torch.isfinite(psfs) & (psfs >= 0)).all()):
+        raise ValueError(f"{name} must be finite and not negative, got a minimum of {float(psfs.min())}")
 
 
 def enclosing_window(psfs: Tensor, share: float) -> int | None:

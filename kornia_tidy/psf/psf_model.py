@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_finite, check_part
+from kornia_tidy.checks import check_choice, check_finite, check_part
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.base import PhaseMasks, central_square
 from kornia_tidy.masks.pixelwise import PixelwiseMask
@@ -48,7 +48,7 @@ from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
 from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
 from kornia_tidy.psf.measured_field import measured_nodes
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
-from kornia_tidy.psf.psf_bank import PSFBank
+from kornia_tidy.psf.psf_bank import PSFBank, checked_nodes
 from kornia_tidy.psf.psf_cache import MEMORY, nodes_around, values_of
 from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
@@ -219,9 +219,13 @@ class PSFModel:
                 axis.
 
         Raises:
-            TypeError: if the field is not numbers.
-            ValueError: if field points are given without a lens, or are not one or more finite points.
+            TypeError: if nodes or field are not numbers.
+            ValueError: if nodes or points of the field are not one or more finite ones, field points are given without
+                a lens, or the data type is another one.
         """
+        if dtype is not None:
+            check_choice("dtype", dtype, (torch.float32, torch.float64))
+        defocus = defocus if defocus is None else checked_nodes(defocus)
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = dtype or (torch.float64 if self.fidelity.double else torch.float32)
         if field is not None and isinstance(self.measured, FieldBank):
@@ -229,14 +233,14 @@ class PSFModel:
             return bank if defocus is None else bank.at_defocus(defocus)
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
-            nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+            nodes = self.defocus_nodes if defocus is None else defocus
             self._warn_if_beyond(points, nodes)
             given = self._of_lens(spectrum.flat(), nodes, self.window, points, tolerance)
             return field_psf_bank(*self.states(dtype), **given).with_stray_light(self.fidelity.stray_light)
         if self.measured is not None:
             bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
             return bank if defocus is None else bank.at_defocus(defocus)
-        nodes = self.defocus_nodes if defocus is None else tuple(defocus)
+        nodes = self.defocus_nodes if defocus is None else defocus
         bank = self._computed_bank(spectrum.flat(), dtype, nodes)
         own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # users may change these
         return own.with_stray_light(self.fidelity.stray_light)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import os
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 from safetensors.torch import save_file
 
 from kornia_tidy import DefocusRange, PSFBank, ThinLensCamera, TiDyOptics
+from kornia_tidy.psf import PSFModel
 from kornia_tidy.psf.psf_bank import enclosing_window
 from kornia_tidy.render import render
 from tests.base import BaseTester
@@ -91,6 +93,36 @@ class TestPSFBank(BaseTester):
         save_file({"weights": torch.ones(3)}, path)
         with pytest.raises(ValueError, match="is not a PSF bank"):
             PSFBank.load(path)
+
+    @pytest.mark.parametrize(
+        ("psfs", "defocus", "message"),
+        [
+            (-torch.ones(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must be finite and not negative, got a minimum"),
+            (torch.ones(2, 3, 5, 5), torch.tensor([1.0, 0.0]), r"defocus must ascend, got \[1.0, 0.0\]"),
+        ],
+    )
+    def test_exception_files_of_no_light(self, psfs, defocus, message, tmp_path):
+        PSFBank(psfs, defocus, torch.ones(2, 3)).save(tmp_path / "bank.safetensors")
+        with pytest.raises(ValueError, match="cannot read .*" + message):
+            PSFBank.load(tmp_path / "bank.safetensors")
+
+    @pytest.mark.parametrize(
+        ("defocus", "error", "message"),
+        [
+            (5, TypeError, "defocus must be a list of nodes in radians, such as .*, got the number 5"),
+            ([], ValueError, r"defocus must be one or more nodes in finite radians, got \[\]"),
+            ([0.0, math.nan], ValueError, "got .*nan"),
+            (["a"], TypeError, "a node of defocus must be a number in radians, got 'a'"),
+        ],
+    )
+    def test_exception_nodes(self, bank, defocus, error, message):
+        for psfs_at in (bank.at_defocus, lambda nodes: TiDyOptics().psf_bank(defocus=nodes)):
+            with pytest.raises(error, match=message):
+                psfs_at(defocus)
+
+    def test_feature_nodes_of_a_tensor_are_those_of_a_list(self):
+        model = PSFModel(fidelity="draft")
+        assert torch.equal(model.psf_bank(defocus=torch.tensor([0.0, 1.0])).psfs, model.psf_bank(defocus=[0, 1]).psfs)
 
     def test_exception_saving_leaves_nothing_behind(self, bank, tmp_path):
         with pytest.raises(FileNotFoundError, match="no folder"):
