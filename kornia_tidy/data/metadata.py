@@ -5,6 +5,7 @@ OpenCV writes EXIF from a block that is encoded already, from version 4.12 on, a
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -68,13 +69,17 @@ def exif_fields(info: Mapping[str, Any]) -> tuple[list[Field], list[Field]]:
     def known(name: str) -> Any:
         return info.get(name)
 
+    def positive(name: str) -> float | None:
+        value = known(name)
+        return value if value is not None and 0 < value < math.inf else None
+
     picture = [_text(tag, known(name)) for tag, name in ((0x010F, "make"), (0x0110, "model")) if known(name)]
     photo: list[Field] = []
     for tag, name, unit in ((0x829A, "exposure", 1), (0x829D, "aperture", 1), (0x920A, "focal_length", 1000)):
-        if known(name):
-            photo.append((tag, RATIONAL, 1, _rational(known(name) * unit)))
-    if known("iso"):
-        photo.append((0x8827, SHORT, 1, struct.pack("<H", min(round(known("iso")), 65535))))
+        if (value := positive(name)) is not None:
+            photo.append((tag, RATIONAL, 1, _rational(value * unit)))
+    if (iso := positive("iso")) is not None:
+        photo.append((0x8827, SHORT, 1, struct.pack("<H", min(round(iso), 65535))))
     if isinstance(known("timestamp"), datetime):
         photo.append(_text(0x9003, known("timestamp").strftime("%Y:%m:%d %H:%M:%S")))
     if known("lens"):

@@ -255,7 +255,8 @@ def checked_nodes(defocus: Sequence[float]) -> tuple[float, ...]:
         >>> checked_nodes(torch.tensor([-1.0, 2.5]))
         (-1.0, 2.5)
     """
-    listed: Any = defocus.tolist() if hasattr(defocus, "tolist") else defocus
+    given: Any = defocus
+    listed = given.tolist() if hasattr(given, "tolist") else given
     if isinstance(listed, str) or not isinstance(listed, Iterable):
         raise TypeError(f"defocus must be a list of nodes in radians, such as [-10.0, 10.0], got {described(listed)}")
     nodes = list(listed)

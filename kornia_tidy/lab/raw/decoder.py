@@ -81,7 +81,7 @@ def decode(data: bytes) -> tuple[dict[str, Any], memoryview]:
         "camera_to_srgb": colors[1],
         "white_balance": raw.camera_whitebalance,
         "daylight_balance": raw.daylight_whitebalance,
-        "flip": raw.sizes.flip,
+        "flip": raw.sizes.flip if tags.orientation_known(directories) else 0,
         "pixel_aspect": raw.sizes.pixel_aspect,
         "info": {**tags.camera_tags(data), **libraw_info(raw)},
     }

@@ -72,6 +72,7 @@ def decode_raw(source: Source, timeout: float, memory_limit: int) -> tuple[dict[
     """
     check_positive("timeout", timeout, "seconds")
     check_positive("memory_limit", memory_limit, "bytes")
+    timeout, memory_limit = min(timeout, 1e6), min(memory_limit, 2**62)  # the system counts no further
     name = source_name(source)
     with _opened(source) as file, TemporaryFile() as result:
         length = file.seek(0, SEEK_END)
@@ -140,9 +141,11 @@ def _opened(source: Source) -> Generator[IO[bytes]]:
         with path.open("rb", buffering=0) as file:
             yield file
         return
-    data = source if isinstance(source, bytes | bytearray | memoryview) else source.read()
+    read = getattr(source, "read", None)
+    data: Any = source if read is None else read()
     if not isinstance(data, bytes | bytearray | memoryview):
-        raise TypeError(f"a raw file must be a path, bytes or a binary file, got a file of {type(data).__name__}")
+        got = f"{'' if read is None else 'a file of '}{type(data).__name__}"
+        raise TypeError(f"a raw file must be a path, bytes or a binary file, got {got}")
     with TemporaryFile(buffering=0) as file:
         file.write(data)
         file.seek(0)

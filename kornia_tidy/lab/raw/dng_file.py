@@ -8,6 +8,7 @@ from datetime import datetime
 import numpy as np
 from torch import Tensor
 
+from kornia_tidy.checks import check_choice, check_finite, check_positive
 from kornia_tidy.data.metadata import exif_fields
 from kornia_tidy.files import write_bytes
 from kornia_tidy.lab.raw.capture import RawCapture, RawInfo
@@ -26,7 +27,8 @@ def write_dng(path: str | os.PathLike[str], raw: RawCapture) -> None:
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if the capture is empty, or a count is not a whole number of 16 bits.
+        ValueError: if the capture is empty, a count is not a whole number of 16 bits, or levels, colours or orientation
+            are not those of a sensor.
     """
     write_bytes(path, encode_dng(raw))
 
@@ -53,6 +55,7 @@ def encode_dng(raw: RawCapture) -> bytes:
         raise ValueError(f"counts must be whole numbers, got {counts.dtype} (of a floating-point DNG)")
     if int(counts.min()) < 0 or int(counts.max()) > 65535:
         raise ValueError(f"counts must lie in 0 to 65535, found {int(counts.min())} to {int(counts.max())}")
+    _check_description(raw)
     samples = counts.permute(1, 2, 0).numpy().astype(np.uint16)
     fields: list[Field] = [
         (274, SHORT, [ORIENTATIONS[raw.flip]]),
@@ -65,6 +68,21 @@ def encode_dng(raw: RawCapture) -> bytes:
     ]
     colors = "".join(dict.fromkeys(raw.colors))
     return dng_bytes(samples, raw.pattern_letters, colors, round(raw.white), fields, exif_fields(vars(raw.info))[1])
+
+
+def _check_description(raw: RawCapture) -> None:
+    """Raise ``ValueError`` unless the levels, colours and orientation of a capture can stand in a DNG."""
+    check_choice("flip", raw.flip, tuple(ORIENTATIONS))
+    if not 0.5 < raw.white < 65535.5:
+        raise ValueError(f"white must be a count from 1 to 65535, got {raw.white}")
+    check_positive("pixel_aspect", raw.pixel_aspect)
+    for name in ("black", "white_balance", "daylight_balance", "xyz_to_camera", "camera_to_srgb"):
+        if (values := getattr(raw, name)) is not None:
+            check_finite(name, values)
+            if name == "black" and bool((values < 0).any()):
+                raise ValueError(f"black must be counts of zero or more, got {float(values.min())}")
+            if name.endswith("balance") and bool((values <= 0).any()):
+                raise ValueError(f"{name} must be positive factors, got {float(values.min())}")
 
 
 # ---------------------------------------------------------------------- fields

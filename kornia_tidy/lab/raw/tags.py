@@ -23,7 +23,7 @@ MOST_LONG_BYTES = 1 << 22  # of a tag that is read for one directory only, such 
 TEXTS = {"make": (0x010F,), "model": (0x0110, 0xC614), "lens": (0xA434,)}
 NUMBERS = {"iso": (0x8827,), "exposure": (0x829A,), "aperture": (0x829D,), "focal_length": (0x920A,)}
 TIMES = (0x9003, 0x0132)
-NOISE_PROFILE, KODAK_MATRIX = 0xC761, 0x9218
+NOISE_PROFILE, KODAK_MATRIX, ORIENTATION = 0xC761, 0x9218, 0x0112
 # The picture of a DNG and how it is stored
 SUBFILE_TYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC = 0x00FE, 0x0100, 0x0101, 0x0102, 0x0103, 0x0106
 SAMPLES, ROWS_PER_STRIP, PLANAR, PREDICTOR, SAMPLE_FORMAT = 0x0115, 0x0116, 0x011C, 0x013D, 0x0153
@@ -36,7 +36,7 @@ WHITE_LEVEL, NEUTRAL, ACTIVE_AREA, OPCODE_LISTS = 0xC61D, 0xC628, 0xC68D, (0xC74
 # Tags that are read; a hostile file may hold 64 KiB behind each of the others.
 WANTED = frozenset(
     [tag for tags in (*TEXTS.values(), *NUMBERS.values(), TIMES, STRIPS, TILES, TILE_SIZE) for tag in tags]
-    + [NOISE_PROFILE, KODAK_MATRIX, SUBFILE_TYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES]
+    + [NOISE_PROFILE, KODAK_MATRIX, ORIENTATION, SUBFILE_TYPE, WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, SAMPLES]
     + [ROWS_PER_STRIP, PLANAR, PREDICTOR, SAMPLE_FORMAT, FILTER_REPEAT, FILTER_PATTERN, FILTER_COLORS, FILTER_LAYOUT]
     + [DNG_VERSION, BLACK_REPEAT, BLACK_LEVEL, WHITE_LEVEL, NEUTRAL, ACTIVE_AREA, *SUB_DIRECTORIES]
 )
@@ -85,6 +85,15 @@ def camera_tags(data: bytes) -> dict[str, Any]:
     found["timestamp"] = next((t for values in _values(directories, TIMES) if (t := _time(_text(values)))), None)
     found["noise_profile"] = next((p for v in _values(directories, (NOISE_PROFILE,)) if (p := _noise_profile(v))), None)
     return {name: value for name, value in found.items() if value is not None}
+
+
+def orientation_known(directories: list[Directory]) -> bool:
+    """Return False if a file gives orientations, and none of them is one of Exif's eight.
+
+    LibRaw takes the last three bits of any number: a quarter turn for 0, which stands for an unknown orientation.
+    """
+    given = [value for values in _values(directories, (ORIENTATION,)) for value in values]
+    return not given or any(value in range(1, 9) for value in given)
 
 
 def kodak_matrix(data: bytes) -> list[list[float]] | None:

@@ -170,6 +170,8 @@ class TestOpen(BaseTester):
     @pytest.mark.parametrize(
         ("orientation", "expected"),
         [
+            (0, lambda x: x),  # unknown
+            (255, lambda x: x),
             (1, lambda x: x),
             (2, np.fliplr),
             (3, lambda x: np.rot90(x, 2)),
@@ -258,9 +260,10 @@ class TestOpen(BaseTester):
         with pytest.raises(ValueError, match="not a regular file"):
             RawCapture.open("/dev/zero")
 
-    def test_exception_of_a_text_file(self):
-        with pytest.raises(TypeError, match="binary file, got a file of str"):
-            RawCapture.open(io.StringIO("text"))
+    @pytest.mark.parametrize(("source", "got"), [(io.StringIO("text"), "a file of str"), (None, "NoneType")])
+    def test_exception_of_other_sources(self, source, got):
+        with pytest.raises(TypeError, match=f"binary file, got {got}"):
+            RawCapture.open(source)
 
 
 class TestOpenDump(BaseTester):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 from datetime import datetime
 
@@ -108,6 +109,27 @@ class TestDng(BaseTester):
             encode_dng(replace(raw, counts=raw.counts.clone().index_fill_(1, torch.tensor([0]), -1)))
         with pytest.raises(ValueError, match=r"needs one pixel or more, got counts of shape \(1, 0, 4\)"):
             encode_dng(replace(raw, counts=raw.counts[:, :0, :4]))
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"flip": 8}, "flip must be one of 0, 1, 3, 2, 4, 6, 7, 5, got 8"),
+            ({"white": 1e6}, "white must be a count from 1 to 65535, got 1000000.0"),
+            ({"white": math.nan}, "white must be a count"),
+            ({"pixel_aspect": math.nan}, "pixel_aspect must be positive"),
+            ({"black": torch.full((2, 2), -5.0)}, "black must be counts of zero or more, got -5.0"),
+            ({"white_balance": torch.zeros(4)}, "white_balance must be positive factors, got 0.0"),
+            ({"xyz_to_camera": torch.full((3, 3), math.nan)}, "xyz_to_camera must be finite, got nan"),
+        ],
+    )
+    def test_exception_descriptions_of_no_sensor(self, change, message):
+        with pytest.raises(ValueError, match=message):
+            encode_dng(replace(capture(), **change))
+
+    def test_feature_exposures_that_are_none_are_left_out(self):
+        info = RawInfo(iso=math.nan, exposure=-1.0, aperture=math.inf, focal_length=0.05)
+        back = RawCapture.open(encode_dng(replace(capture(), info=info))).info
+        assert (back.iso, back.exposure, back.aperture, back.focal_length) == (None, None, None, 0.05)
 
     def test_exception_no_folder(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="there is no folder"):
