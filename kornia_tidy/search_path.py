@@ -85,7 +85,7 @@ def missing(name: str, user: str, error: Exception) -> ImportError:
     Args:
         name: of the module.
         user: needs the package, for the message.
-        error: of the import. It is told unless it says that the package is not installed.
+        error: of the import. The message quotes it, unless it only says that the package is not installed.
 
     Example:
         >>> missing("matplotlib.figure", "a picture", ModuleNotFoundError(name="matplotlib"))

@@ -96,7 +96,7 @@ def rendering_work(
     image = torch.zeros((), dtype=dtype, device=defocus.device).expand(batch, channels, *defocus.shape[-2:])
     psfs = image.new_zeros(()).expand(len(nodes), channels, window, window)
     at = defocus.new_tensor(list(nodes))
-    if compositing == "gather" and border != "valid":  # what lies beyond the image costs nothing
+    if compositing == "gather" and border != "valid":  # pixels beyond the image cost nothing
         border = "replicate"
     scene = layered_scene(image, defocus, at, psfs, None, compositing, layers, border)
     # A processor's choice looks at the PSFs' values: of one layer, as all of a wide range would take gigabytes.

@@ -77,7 +77,7 @@ class LinearCamera(nn.Module):
         self.register_buffer("valid", valid, persistent=False)
         optics.defocus(depth)  # raises
         if field_center is not None and len(depth) > 1:
-            check_centers(field_center, len(depth))  # raises too; places of images with one depth on use
+            check_centers(field_center, len(depth))  # raises; with one depth, places are checked on use
 
     def forward(self, light: Tensor) -> Tensor:
         """Return the irradiance A x of linear light x."""

@@ -56,7 +56,7 @@ def gather_direct(
 def count_terms(psfs: Tensor) -> int:
     """Return the number of terms of all PSFs: as direct.c counts them, except that all PSFs take them of the same kind.
 
-    A disc's columns are runs of one value, of which sums of the light down its columns give each by its two ends.
+    A disc's columns are runs of one value. Sums of the light down each column give a run from its two ends.
 
     Args:
         psfs: (D, C, P, P).

@@ -82,7 +82,7 @@ class FieldBank(BankOfPSFs):
         )
 
     def _mixed(self, weights: Tensor, **rest: Tensor) -> FieldBank:
-        """Return the bank at n places, by the weights (n, F) there of those that it holds."""
+        """Return the bank at n places, a mixture of the nodes with the weights (n, F)."""
         held = {k: value for k, value in self.present().items() if k != "defocus" and k not in rest}
         return replace(self, **{k: torch.tensordot(weights.to(value), value, 1) for k, value in held.items()}, **rest)
 

@@ -343,7 +343,7 @@ def _stop_grid(degree: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=8)
 def _projection(degree: int) -> tuple[Tensor, Tensor]:
-    """Return the polynomials at points of the disc, (J, n), and what gives a function's series from its values, (n, J).
+    """Return the polynomials at points of the disc, (J, n), and the projection of values onto a series, (n, J).
 
     Gauss's rule for the radius squared and evenly spaced azimuths integrate products of the polynomials exactly.
     """
@@ -373,7 +373,7 @@ def _light(turned: Sequence[TurnedLens], stop: Stop, transmission: Tensor) -> tu
 
 
 def _rows(turned: Sequence[TurnedLens], stretch: float, middle: float) -> Tensor:
-    """Return the series of what points in the stop are, (F, rows, J).
+    """Return the series over the stop of each quantity of its points, (F, rows, J).
 
     Rows are the direction cosines along y and x, less the chief ray's, times a factor and with a constant added; the
     terms of the wavefront in turns; those of the amplitude.
@@ -425,7 +425,7 @@ class TurnedLens:
         degree: of the polynomials.
         edges: of rims, centre along the field and radius in stop radii, (E, 2).
         azimuth: of the field point, from +x towards +y.
-        shift: y and x by which light passes masks off the stop beside where it passes the stop, in stop radii.
+        shift: y and x from where light passes the stop to where it passes masks off the stop, in stop radii.
         psi: defocus in radians at 530 nm, (D,).
         wavelength: in metres.
     """

@@ -19,7 +19,7 @@ _OF_EVERY_MODULE = frozenset(vars(nn.Module()))  # parameters and hooks among th
 
 @dataclass(frozen=True, eq=False)
 class _Remembered:
-    """Tensors of each depth, and what was made of those that were asked for last."""
+    """Tensors of each depth, and the result made from the tensors of the last call."""
 
     depths: dict[float, tuple[Tensor, ...]] = field(default_factory=dict)
     asked: tuple[tuple[float, ...], Hashable] | None = None
@@ -68,8 +68,8 @@ class PSFMemory:
             key: all that they depend on besides depth, see :func:`values_of`.
             defocus: depths in radians, ascending.
             make: computes the tensors of some depths, each with an axis of depths first.
-            form: what to return, made of the tensors. Default: a tuple of them.
-            how: tells apart what was made of the same tensors.
+            form: makes the result from the tensors. Default: a tuple of them.
+            how: identifies the form, where the same tensors have several results.
         """
         with torch.inference_mode(False), torch.no_grad():  # remembered tensors serve in training too
             known = self._held.pop(key, None) or _Remembered()
@@ -102,7 +102,7 @@ MEMORY = PSFMemory()
 
 
 def values_of(*parts: object) -> tuple[Hashable, ...]:
-    """Return what tells tensors and modules apart: tensors by value; modules by themselves and their plain attributes.
+    """Return a key for tensors and modules: the values of tensors; the identity and plain attributes of modules.
 
     Example:
         >>> from kornia_tidy.modulator.modulator import DwellTimes

@@ -81,7 +81,7 @@ class Pupil:
 
         Args:
             amplitude: (n, n), or (K, n, n) for K masks.
-            shares: of the time of each mask, (K,), by which the light of several amplitudes adds up.
+            shares: fraction of the exposure of each mask, (K,), to average the light of several amplitudes.
         """
         pupil = copy.copy(self)
         transmission = amplitude.double().square()

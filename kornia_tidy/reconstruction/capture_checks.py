@@ -1,4 +1,4 @@
-"""Captures as they come from a real sensor: outliers are repaired, and what contradicts the noise is told."""
+"""Checks of captures from a real sensor: outliers are repaired, contradictions to the stated noise are reported."""
 
 from __future__ import annotations
 
@@ -95,8 +95,8 @@ class MeasuredNoise(NamedTuple):
 def measure_noise(light: Tensor) -> MeasuredNoise | None:
     """Measure the noise of a capture by its most even places.
 
-    In squares of 8 x 8 pixels the second difference along both axes leaves noise and little of a blurred scene. Of the
-    squares of a level of light those of least variance show noise alone; a line through the levels is its model.
+    In squares of 8 x 8 pixels the second difference along both axes leaves noise and little of a blurred scene. At each
+    level of light the squares of least variance show only noise. A line through the levels is the model of the noise.
 
     Args:
         light: (C, H, W) linear light.
@@ -141,7 +141,7 @@ def measure_noise(light: Tensor) -> MeasuredNoise | None:
 
 
 def blockiness(light: Tensor) -> float:
-    """Return by which factor differences across the borders of 8 x 8 blocks exceed others, as JPEG leaves them.
+    """Return the factor by which differences across the borders of 8 x 8 blocks exceed others, a trace of JPEG.
 
     Args:
         light: (C, H, W).
@@ -177,7 +177,7 @@ def _slope(level: Tensor, variance: Tensor, weight: Tensor) -> float:
 
 
 class CheckedCapture(NamedTuple):
-    """A capture without outliers, and what there is to tell of it."""
+    """A capture without outliers, with its noise and notes."""
 
     light: Tensor
     """(C, H, W)."""
@@ -190,11 +190,11 @@ class CheckedCapture(NamedTuple):
 
 
 def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCapture:
-    """Repair the outliers of a capture, and compare what it shows with what is told of it.
+    """Repair the outliers of a capture, and compare its noise with the stated noise.
 
     Args:
         light: (C, H, W) linear light.
-        told: noise by which the capture will be restored. None: nothing is compared.
+        told: the stated noise, with which the capture will be restored. None: nothing is compared.
 
     Example:
         >>> light = 0.5 + 0.01 * torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0))

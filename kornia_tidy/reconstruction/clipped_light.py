@@ -1,4 +1,4 @@
-"""Light beyond full scale, as the pixels around those that are clipped let expect it."""
+"""Light beyond full scale: an estimate for clipped pixels from the pixels around them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NEAR, WIDER = 1.5, 3.0  # px, of the Gaussian weights of u and of m
 
 
 def beyond_full_scale(light: Tensor, noise: Tensor | float) -> Tensor:
-    """Return light whose clipped pixels have the excess over full scale that is expected of them.
+    """Return light whose clipped pixels have their expected excess over full scale.
 
     A pixel that is clipped in the middle of others, or beside much darker ones, is brighter than one that noise lifts
     to full scale. So a deconvolution rings less around clipped places.

@@ -188,7 +188,7 @@ def reconstruct_light(
 
 
 def _with_least_noise(head: LightHead, least: float, level: float) -> LightHead:
-    """Return a head that takes the noise of its sensor for even noise, at least so much; itself where it is told."""
+    """Return a head with even noise of at least ``least``; the head itself if it was given its noise."""
     if not least or head.noise is not None or (told := _told_noise(head)) is None:
         return head
     copied = cast("LightHead", shared_copy(head))
@@ -219,7 +219,7 @@ def _over_field(
 
 
 def _told_noise(head: LightHead) -> MeasuredNoise | None:
-    """Return the noise by which a network restores captures; None if it does not take it."""
+    """Return the noise with which a network restores captures; None if it takes none."""
     if head.noise is not None:
         return MeasuredNoise(head.noise**2, 0.0)
     models = [part.noise_model.tolist() for part in head.modules() if isinstance(part, ClosedForm)]

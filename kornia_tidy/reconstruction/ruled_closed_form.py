@@ -32,7 +32,7 @@ from kornia_tidy.render.borders import next_fast_size, pad_border
 
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
-FINER = 2  # Wiener filters for less noise than those that a network is shown
+FINER = 2  # more Wiener filters, for less noise than those of the network
 NOISES = tuple(WIENER_NOISES[0] * 10 ** (STEP * i) for i in range(-FINER, 0)) + WIENER_NOISES
 TIKHONOV = (3e-2, 1e-2, 3e-3, 1e-3)  # weights of the filters that follow, whose inverses of wide PSFs are cut less
 FILTERS = len(NOISES) + len(TIKHONOV)
@@ -42,7 +42,7 @@ LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the
 STEPS = 20  # places between two kernels among which the best is sought
 COLORS = tuple(0.01 * 2 ** (i / 2) for i in range(11))  # 0.01 to 0.32, widths of the bilateral filter in colour
 USUAL, AROUND = 3.2, 2  # width in standard deviations of the restored noise about which it is sought, and steps
-PERTURBED = 0.1  # of the noise: by which the filter is perturbed to find how it takes noise
+PERTURBED = 0.1  # of the noise: the perturbation that measures how the filter passes noise
 NEAR = 5  # px, over which light is averaged to find by how much its noise is encoded
 SAMPLED, SAMPLES = 160, 2  # px, side of the windows from which settings follow; their largest number along an axis
 CAMERA_MAPS = 10
@@ -421,7 +421,7 @@ def _risk(first: Tensor, second: Tensor, noise: Tensor, color: Tensor) -> Tensor
 
 
 def _parabolas(halves: Tensor) -> Tensor:
-    """Interpolate a square of what is linear between nodes, from its values at the nodes and midway, (N,)."""
+    """Interpolate the square of a piecewise linear function from its values at the nodes and midway, (N,)."""
     first, middle, last = halves[:-2:2], halves[1::2], halves[2::2]
     place = torch.arange(STEPS, dtype=halves.dtype, device=halves.device) / STEPS
     bent, rise = 2 * (first - 2 * middle + last), 4 * middle - 3 * first - last

@@ -66,7 +66,7 @@ def share_within(height: int, width: int, psf_size: int, device: torch.device | 
 
 
 def pixels_around(side: int, radius: Tensor) -> Tensor:
-    """Return the number of pixels of a line within a radius of each of its pixels, (side, K), for K radii.
+    """Return how many pixels of a line lie within a radius of each pixel, (side, K), for K radii.
 
     Example:
         >>> pixels_around(3, torch.tensor([1.0])).flatten().tolist()

@@ -28,7 +28,7 @@ def as_python(settings: Settings) -> str:
     """Return a script that takes the same capture and reconstructs it in the same way.
 
     Args:
-        settings: of the capture. Those that are not default stand in the script, in SI units.
+        settings: of the capture. The script lists those that differ from the defaults, in SI units.
 
     Returns:
         The text of the script. It writes ``capture.png`` and ``reconstruction.png``, and ``depth.npy`` in metres if the

@@ -85,7 +85,7 @@ class Control:
         return setting if self.per_unit == 0 else _scaled(Decimal(repr(setting)), -self.per_unit)
 
     def check(self, setting: Any) -> None:
-        """Raise ``ValueError`` if a value of the setting is none of the choices, or beyond the range."""
+        """Raise ``ValueError`` unless a value of the setting is one of the choices, or within the range."""
         if isinstance(setting, str) and self.choices:
             check_choice(self.label, setting, tuple(value for _, value in self.choices))
         if self.low is None or self.high is None:

@@ -59,16 +59,16 @@ class ReconstructRaw:
             --psfs or --masks, a closed form. None: with these the network for any camera.
         psfs: file of kornia-tidy raw calibrate-psf; its PSFs deconvolve the captures. None:
             those of the network's camera.
-        masks: of the camera: a file of heights, or the number of those that raw simulate makes. None: those of head or
+        masks: of the camera: a file of heights, or the number of masks that raw simulate makes. None: those of head or
             psfs.
-        lens: a real lens around them, by its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json).
+        lens: a real lens around the masks: its name, a file that Lens.save wrote, or its surfaces (.zmx, .seq, .json).
             Captures are whole pictures, as large as the first; each tile is restored by the PSFs of its place. None: an
             ideal lens.
         settings: of the camera with these masks.
         noise: standard deviation of the read noise in linear light, of full scale; or the file that kornia-tidy raw
             calibrate-noise wrote. None: by the noise profile of the raw file, else that of the network's simulated
             sensor.
-        resume: skip files whose results are complete, made of the same files with the same settings.
+        resume: skip files that already have complete results with the same settings.
         format: of the 16-bit picture.
         depth_unit: of FILE_depth.png.
         linear: FILES that are pictures hold linear light, not sRGB.
@@ -86,7 +86,7 @@ class ReconstructRaw:
     Notes:
         Without a network of your camera, give the camera: its file as HEAD, its measured PSFs, or
         its masks with its lens.
-        One network, any-camera, restores the captures of any camera that it is told. All others fit
+        One network, any-camera, restores the captures of any camera that you give it. All others fit
         the camera that they were trained with, its masks and its lens. The library includes, for a
         50 mm lens and pixels of 8 um
           edof-5                      picture: five masks; f/17.6, at 0.6 m

@@ -129,7 +129,7 @@ def _fitted(system: FirstOrder, wavelength: float, heights: Array, psi: Array, p
 
 
 def _area(along: Tensor, across: Tensor, points: Array) -> Tensor:
-    """Return the area to which a map takes an area of the stop, from its coefficients, (..., N)."""
+    """Return the factor of area of a map of the stop, from its coefficients, (..., N)."""
     steps, columns = 1e-4 * np.eye(2), []
     for step in steps:
         rise = [

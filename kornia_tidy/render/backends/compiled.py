@@ -136,8 +136,8 @@ class _Sums:
             count, side, terms = self.psfs.shape[0] * self.psfs.shape[1], self.psfs.shape[-1], 0
             if side <= LARGEST_DIRECT:
                 terms = side**2
-            # Most pairs of neighbours in the middle of a disc are equal, and in that of other PSFs none is; where work
-            # is counted, one number stands for all samples.
+            # Most pairs of neighbours in the middle of a disc are equal, and none in that of other PSFs. Where only
+            # work is counted, PSFs are one expanded number.
             elif self.psfs.stride(-1) and 2 * int(self.psfs[..., side // 2].diff().count_nonzero()) <= count * side:
                 terms = -(-count_terms(self.psfs) // count)
             if terms and (side <= LARGEST_DIRECT or 2 * terms <= side**2):

@@ -42,7 +42,7 @@ class Part:
         return planes[images, ..., rows, columns]
 
     def chosen(self, by_layer: Tensor) -> Tensor:
-        """Return what a tensor holds of the part's layers."""
+        """Return a tensor's entries of the part's layers."""
         return by_layer if self.layers is None else by_layer[self.layers]
 
     def numbered(self, layer_index: Tensor, layers: int) -> Tensor:

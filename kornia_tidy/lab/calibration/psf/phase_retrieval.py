@@ -271,7 +271,7 @@ class _Model:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Move the defocus offset to the nodes, where it is exact, if it is no longer small."""
+        """Add the defocus offset to the nodes if it is no longer small: there it is exact."""
         if abs(float(self.offset)) > 0.25:
             self.centre += float(self.offset)
             self.offset.zero_()
