@@ -25,7 +25,7 @@ from kornia_tidy.checks import (
     check_positive,
 )
 from kornia_tidy.choices import COMPOSITING
-from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.kernels.pixel_ops import decode, encode
 from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.aperture import circular_aperture
@@ -148,14 +148,10 @@ def depth_blur(
     if compositing != "occlusion":
         radius = radius.abs()  # near and far discs are alike: only occlusion needs their order
     layer = disc_layer(radius, max_radius)
-    light = image.to(dtype)
-    if color_space == "srgb":
-        light = srgb_to_linear(light)
+    light = decode(image.to(dtype), color_space)
     discs = _discs(layer, image.shape[1], max_radius)
     blurred = render(light, layer, discs, compositing, border="replicate")
-    if color_space == "srgb":
-        blurred = linear_to_srgb(blurred)
-    return blurred.to(image.dtype)
+    return encode(blurred, color_space).to(image.dtype)
 
 
 def _warn_of_unit(depth: Tensor, f_number: float | Tensor, focal_length: float, pixel_pitch: float) -> None:

@@ -75,7 +75,7 @@ class LinearCamera(nn.Module):
             depth, valid = fill_holes(depth)
         self.register_buffer("depth", depth, persistent=False)
         self.register_buffer("valid", valid, persistent=False)
-        optics.defocus(depth)  # raises
+        optics.camera.defocus(depth, optics.check_inputs)  # raises
         if field_center is not None and len(depth) > 1:
             check_centers(field_center, len(depth))  # raises; with one depth, places are checked on use
 
@@ -113,7 +113,7 @@ class LinearCamera(nn.Module):
 
     def _blurred(self, light: Tensor) -> Tensor:
         optics, dtype = self.optics, self._dtype(light.dtype)
-        defocus = optics.defocus(self.depth.to(dtype))
+        defocus = optics.camera.defocus(self.depth.to(dtype), optics.check_inputs)
         strip = Strip(light.to(dtype), defocus, defocus, optics.border, fields=self._fields(len(light)))
         return optics.blurred(strip).to(light.dtype)
 
@@ -132,7 +132,7 @@ class LinearCamera(nn.Module):
         """Return defocus, nodes, PSFs and stray light, and the options of the renderer."""
         dtype = self._dtype(dtype)
         now = self.optics
-        defocus = now.defocus(self.depth.to(dtype))
+        defocus = now.camera.defocus(self.depth.to(dtype), now.check_inputs)
         bank: PSFBank = now.psf_model.scene_bank(channels, dtype, defocus)
         fidelity = now.psf_model.fidelity
         layers = "nearest" if fidelity.layers == "nearest" else "linear"

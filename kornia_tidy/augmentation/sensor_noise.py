@@ -12,7 +12,7 @@ from torch import Tensor
 from kornia_tidy.augmentation.ranges import Range, check_probability, checked_range, uniform_draws
 from kornia_tidy.augmentation.rows import changed_rows, outside_graphs, row_seeds
 from kornia_tidy.checks import check_choice, check_float_tensor
-from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.kernels.pixel_ops import decode, encode
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import check_image, warn_once
 from kornia_tidy.sensor.sensor import SensorNoise
@@ -80,15 +80,11 @@ def sensor_noise(
     if params is None:
         both = SensorNoise(1.0, full_well=1.0)
         params = both.draw(image.shape, device=image.device, generator=generator, dtype=dtype)
-    light = image.to(dtype)
-    if color_space == "srgb":
-        light = srgb_to_linear(light)
+    light = decode(image.to(dtype), color_space)
     electrons = shot_noise(light.clamp(min=0) * well + dark, params["shot"].to(light)).minimum(well)
     value = (electrons - dark + sigma * params["read"].to(light)) / well
     value = (value if bits is None else quantize(value, bits)).clamp(0, 1)
-    if color_space == "srgb":
-        value = linear_to_srgb(value)
-    return value.to(image.dtype)
+    return encode(value, color_space).to(image.dtype)
 
 
 def _of_rows(name: str, value: float | Tensor, image: Tensor, dtype: torch.dtype) -> Tensor:

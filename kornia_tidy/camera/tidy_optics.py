@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -28,7 +28,7 @@ from kornia_tidy.camera.samples import (
 from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.kernels.srgb_ops import linear_to_srgb, srgb_to_linear
+from kornia_tidy.kernels.pixel_ops import decode, encode
 from kornia_tidy.masks.base import PhaseMasks, parameter_groups
 from kornia_tidy.mode import Mode, torch_mode, values_unread
 from kornia_tidy.optics.holes import HOLES
@@ -253,7 +253,7 @@ class TiDyOptics(CameraState):
                 if self.sensor is not None:
                     noise = None if params is None else {name: field[..., rows, :] for name, field in params.items()}
                     seen = self.sensor(seen, params=noise, generator=generator, origin=(rows.start, 0))
-                seen = self.encode(seen).to(dtype)
+                seen = encode(seen, self.color_space).to(dtype)
                 coded = seen if strip.rows is None else placed(coded, seen, rows, self.height(sample))
             return sample.coded(cast("Tensor", coded))
 
@@ -287,8 +287,9 @@ class TiDyOptics(CameraState):
         rows = self._rows_at_once(sample, fields) if sample.bytes_at_once > self.memory_budget // 2 else None
         if rows is None:
             image, depth = sample.image.to(sample.dtype), sample.depth.to(sample.dtype)
-            light, defocus = self.decode(image), self.defocus(depth)
             unread = Mode.UNREAD in torch_mode()
+            light = decode(image, self.color_space)
+            defocus = self.psf_model.camera.defocus(depth, self.check_inputs and not unread)
             reach = (
                 defocus_extremes_in_one_read(image, depth, defocus, self)
                 if unread
@@ -300,10 +301,11 @@ class TiDyOptics(CameraState):
         if sample.image.device.type != "cpu":
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
-        reach = defocus_extremes((self.defocus(part.to(sample.dtype)) for part in parts), self)
+        to_defocus = partial(self.psf_model.camera.defocus, check_inputs=self.check_inputs)
+        reach = defocus_extremes((to_defocus(part.to(sample.dtype)) for part in parts), self)
         given = rows, self.height(sample), self.window // 2, self.border, fields
         for own, image, depth, places in strips_of(sample, *given):
-            yield Strip(self.decode(image), self.defocus(depth), reach, "valid", own, places)
+            yield Strip(decode(image, self.color_space), to_defocus(depth), reach, "valid", own, places)
 
     def irradiance(self, sample: Sample, views: Sequence[TiDyOptics]) -> list[Tensor]:
         """Return the irradiance of a scene on the sensor, (B, C, h, w), through each of some views of this camera.
@@ -353,20 +355,11 @@ class TiDyOptics(CameraState):
 
     def decode(self, image: Tensor) -> Tensor:
         """Return linear light from an image (B, C, H, W) in the camera's colour space."""
-        return srgb_to_linear(image) if self.color_space == "srgb" else image
+        return decode(image, self.color_space)
 
     def encode(self, light: Tensor) -> Tensor:
         """Return an image in the camera's colour space from linear light (B, C, H, W)."""
-        return linear_to_srgb(light) if self.color_space == "srgb" else light
-
-    def defocus(self, depth: Tensor) -> Tensor:
-        """Return the defocus map of a depth map in radians at 530 nm, checked as the camera's inputs are.
-
-        Raises:
-            ValueError: if the camera checks its inputs and a depth is NaN or not positive.
-        """
-        checked = self.check_inputs and not torch_mode() & (Mode.GRAPH | Mode.UNREAD)
-        return self.psf_model.camera.defocus(depth, check_inputs=checked)
+        return encode(light, self.color_space)
 
     def draw(self, image: Tensor, generator: torch.Generator | None = None) -> dict[str, Tensor]:
         """Draw the noise of one capture of an image like this one, for ``params=``.
@@ -415,7 +408,8 @@ class TiDyOptics(CameraState):
             found = f"{len(sample.image)} and {len(sample.depth)}"
             raise ValueError(f"a plan needs at least one image and its depth, got {found}")
         light = None if image is None else self.decode(sample.image.to(sample.dtype))
-        defocus = self.defocus(sample.depth.to(compute_dtype(depth.dtype, self.fidelity, depth.device)))
+        metres = sample.depth.to(compute_dtype(depth.dtype, self.fidelity, depth.device))
+        defocus = self.camera.defocus(metres, self.check_inputs)
         return plan_scene(self, defocus, light, (len(sample.image), sample.image.shape[1]), tolerance)
 
     @torch.no_grad()
@@ -440,7 +434,8 @@ class TiDyOptics(CameraState):
         sample = read_sample(image, depth, self)
         if len(sample.image) == 0:
             raise ValueError("an explanation needs at least one image, got a batch of none")
-        light, defocus = self.decode(sample.image.to(sample.dtype)), self.defocus(sample.depth.to(sample.dtype))
+        light = self.decode(sample.image.to(sample.dtype))
+        defocus = self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs)
         reach, (batch, channels, height, width) = defocus_extremes([defocus], self), light.shape
         center = sample.centers[0] if sample.centers else self.field_center
         field = self.psf_model.field_of((height, width), center)
@@ -495,7 +490,7 @@ class TiDyOptics(CameraState):
     def check_scene(self, image: Tensor, depth: Tensor) -> None:
         """Check the values of an image and its depth as a capture does, and warn of other units."""
         sample = read_sample(image, depth, self)
-        defocus = self.defocus(sample.depth.to(sample.dtype)).detach()
+        defocus = self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs).detach()
         if self.check_inputs:
             warn_of_defocus(torch.stack(torch.aminmax(defocus)), self)
 

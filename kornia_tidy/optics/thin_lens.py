@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive, check_values
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
@@ -217,7 +218,7 @@ class ThinLensCamera(nn.Module):
 
         Args:
             depth: metres, any shape; ``inf`` is allowed.
-            check_inputs: refuse NaN, zero and negative depths.
+            check_inputs: refuse NaN, zero and negative depths, unless values are unknown, as while compiling.
 
         Returns:
             Radians, same shape and dtype.
@@ -225,7 +226,8 @@ class ThinLensCamera(nn.Module):
         Raises:
             ValueError: if a depth is NaN or not positive.
         """
-        if check_inputs and depth.numel() and (depth.is_meta or not bool(depth.detach().amin() > 0)):  # NaN too
+        looks = check_inputs and depth.numel() and Mode.GRAPH not in torch_mode()
+        if looks and (depth.is_meta or not bool(depth.detach().amin() > 0)):  # NaN too
             check_depth(depth)
         return thin_lens_defocus(depth, self.aperture_diameter / 2, self.focus_distance)
 
@@ -402,12 +404,12 @@ class DefocusRange(nn.Module):
 
         Args:
             depth: normalised disparity in [0, 1], any shape; the result has the same shape and dtype.
-            check_inputs: refuse NaN and values outside [0, 1].
+            check_inputs: refuse NaN and values outside [0, 1], unless values are unknown, as while compiling.
 
         Raises:
             ValueError: if a value is NaN or outside [0, 1].
         """
-        if check_inputs and depth.numel():
+        if check_inputs and depth.numel() and Mode.GRAPH not in torch_mode():
             check_values("depth", depth)
             lowest, highest = torch.aminmax(depth.detach())
             if not bool((lowest >= 0) & (highest <= 1)):  # False for NaN too

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from math import ceil, floor
-from typing import Any, NoReturn, Self, cast
+from typing import Any, NamedTuple, NoReturn, Self, cast
 
 import numpy as np
 import torch
@@ -63,6 +63,20 @@ MOST_FIELDS = 8  # sizes and places of pictures with remembered nodes
 _SAMPLING = 0.1  # tolerance of PSFs that only show where the light goes
 
 
+class Layering(NamedTuple):
+    """How PSFs are sampled over defocus and on the sensor.
+
+    Args:
+        nodes: defocus of the layers in radians.
+        side: of the PSFs in pixels.
+        blur: layers and grids of wide blur, or None.
+    """
+
+    nodes: tuple[float, ...]
+    side: int
+    blur: WideBlur | None
+
+
 class CachedParts:
     """What follows from the parts of a PSF model and is found when it is first asked for: window, pupil, wide blur."""
 
@@ -71,6 +85,7 @@ class CachedParts:
         self.pupil: Pupil | None = None
         self.blur: WideBlur | None = None
         self.blur_known = False
+        self.layering: tuple[object, Layering] | None = None  # and the attributes of parts that it follows from
         self.fields: dict[object, Field] = {}  # by size and place of the picture, and what else they follow from
 
 
@@ -294,7 +309,7 @@ class PSFModel:
         if self.measured is not None:
             places = None if field is None else field.points
             return self._measured_bank(spectrum, dtype, device or defocus.device, places)
-        nodes, kind = self.defocus_nodes, self.fidelity.layers
+        nodes, kind = self.layering.nodes, self.fidelity.layers
         stray_light = self.fidelity.stray_light, len(spectrum.basis or (1,))
         if kind in ("nearest", "linear"):
             held = nodes_around(nodes, defocus)
@@ -418,8 +433,7 @@ class PSFModel:
         Those of a field are (D, F C, P, P) before stray light is dealt with, and a bank over the field after that.
         """
         states, weights = self.states(dtype)
-        traced = torch_mode() & Mode.TRACED
-        side, grid = self.window if traced else self.fitted.side, 1  # the light in it is measured at the first PSFs
+        traced, (_, side, blur), grid = torch_mode() & Mode.TRACED, self.layering, 1
         if group is not None:
             side, grid = group.window, group.grid
         learning = torch.is_grad_enabled() and (states.requires_grad or weights.requires_grad)
@@ -427,7 +441,7 @@ class PSFModel:
         learning = learning or (amplitude is not None and torch.is_grad_enabled() and amplitude.requires_grad)
         exact = partial(self._exact_psfs, spectrum, grid, points=AXIS if field is None else field.points)
         build = partial(exact, states, weights, window=side, each_state=each_state)
-        if (blur := self.wide_blur) is not None and not traced and not each_state:
+        if blur is not None and not traced and not each_state:
             if learning:  # the PSFs are remembered; their gradients are made in the backward pass
                 with torch.no_grad():
                     bank = self._computed_bank(spectrum, dtype, nodes, group=group)
@@ -679,6 +693,24 @@ class PSFModel:
             spacing = min(spacing, interpolable_spacing(self._band()))
         intervals = max(1, round((hi - lo) / spacing))
         return tuple(lo + (hi - lo) * i / intervals for i in range(intervals + 1))
+
+    @property
+    def layering(self) -> Layering:
+        """Nodes, window and wide blur of PSFs that are computed: all that a capture asks before it asks for PSFs.
+
+        They stay while the camera's range and the modulator's pixels stay, and flat masks flat where blur is wide.
+        """
+        derived, mode = self._derived, torch_mode()
+        parts = self.camera.defocus_range, getattr(self.modulator, "fill_factor", 1.0)
+        if derived.layering is not None and derived.layering[0] == parts:
+            known = derived.layering[1]
+            if known.blur is None or Mode.GRAPH in mode or is_flat(self.states(torch.float32)[0]):
+                return known
+        side = self.window if mode & Mode.TRACED else self.fitted.side  # the light in it is measured at the first PSFs
+        known = Layering(self.defocus_nodes, side, self.wide_blur)
+        if not mode & Mode.TRACED:
+            derived.layering = parts, known
+        return known
 
     @property
     def varies(self) -> bool:

@@ -108,17 +108,18 @@ def pieces_of(
         >>> piece.bank().psfs.shape[:2], piece.span
         (torch.Size([6, 3]), None)
     """
-    scene = reach if scene is None else scene
-    if (blur := None if Mode.GRAPH in torch_mode() else model.wide_blur) is not None:
+    scene, mode = reach if scene is None else scene, torch_mode()
+    layering = None if Mode.GRAPH in mode or model.measured is not None else model.layering
+    if (blur := layering and layering.blur) is not None:
         if compositing == "gather" and scene.numel():
             yield from _wide_pieces(model, blur, channels, dtype, scene)
             return
         _check_wide_bytes(blur, channels, dtype, compositing, budget)
     most, remembered = None, True
     points = 1 if field is None else len(field.points)
-    if blur is None and budget is not None and not torch_mode():
-        side = max(model.fidelity.window or model.fidelity.max_window, model.fitted.side)
-        if _MOST_COPIES * channels * dtype.itemsize * len(model.defocus_nodes) * side**2 * points > budget // 2:
+    if layering is not None and blur is None and budget is not None and not mode:
+        side = max(model.fidelity.window or model.fidelity.max_window, layering.side)
+        if _MOST_COPIES * channels * dtype.itemsize * len(layering.nodes) * side**2 * points > budget // 2:
             most, remembered = _most_layers(model, channels, dtype, reach, compositing, budget, points)
     source = model if remembered else model.without_memory()
     given: dict[str, Any] = {"channels": channels, "dtype": dtype, "device": device or reach.device, "field": field}
@@ -127,7 +128,7 @@ def pieces_of(
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
-        if Mode.UNREAD in torch_mode() and field is None:  # all states in one bank, for one rendering
+        if Mode.UNREAD in mode and field is None:  # all states in one bank, for one rendering
             yield Piece(partial(make, source, defocus=reach, each_state=True), shares)
             return
         for state, share in enumerate(shares):

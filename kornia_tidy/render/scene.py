@@ -66,6 +66,7 @@ class LayeredScene:
 
     Args:
         image: (B, C, H, W) linear light in float32 or float64.
+        plane: (B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels.
         layer_index: (B or 1, 1, H, W) int64 index of each pixel's layer.
         layer_weight: (B or 1, 1, H, W) weight of the next layer, or None for nearest layers.
         psfs: (D, C, P, P) of the image's dtype, with P odd; with a field (F, D, C, P, P).
@@ -79,6 +80,7 @@ class LayeredScene:
     """
 
     image: Tensor
+    plane: Tensor
     layer_index: Tensor
     layer_weight: Tensor | None
     psfs: Tensor
@@ -100,12 +102,6 @@ class LayeredScene:
     def padded_size(self) -> tuple[int, int]:
         """Height and width of :attr:`plane`."""
         return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
-
-    @property
-    def plane(self) -> Tensor:
-        """(B, C, h + P - 1, w + P - 1) image with its border, for an output of h x w pixels; made anew each time."""
-        margin = (self.psfs.shape[-1] // 2,) * 4
-        return self.image if self.border == "valid" else pad(self.image, margin, PAD_MODES[self.border])
 
     @property
     def batch_weight(self) -> Tensor | None:
@@ -195,8 +191,10 @@ def layered_scene(
     index, weight = index[:, 0], None if weight is None else weight[:, 0]
     with_gradient = weight is not None and weight.requires_grad and torch.is_grad_enabled()
     of_batch = None if weight is None else weight.detach().expand(batch, -1, -1)
+    light = image.to(kind)
     return LayeredScene(
-        image.to(kind),
+        light,
+        light if border == "valid" else pad(light, (radius,) * 4, PAD_MODES[border]),
         layer_index,
         layer_weight,
         (psfs.flip((-2, -1)) if correlate else psfs).to(kind),

@@ -19,8 +19,8 @@ from kornia_tidy.checks import (
     check_part,
     check_positive,
 )
+from kornia_tidy.kernels.pixel_ops import record
 from kornia_tidy.kernels.precision import safe_sqrt
-from kornia_tidy.kernels.sensor_ops import record
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import NONSENSE_CODE, check_image, warn_once
 from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor, check_values
-from kornia_tidy.kernels.sensor_ops import quantized, record
+from kornia_tidy.kernels.pixel_ops import quantized, record
 
 
 def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:

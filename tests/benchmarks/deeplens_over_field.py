@@ -62,7 +62,7 @@ def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, r
     image, depth = (part[None] for part in dead_leaves(*size, num_leaves=size[0] * size[1] // 3000))
     masks = PixelwiseMask(5, generator=torch.Generator().manual_seed(3))
     optics = TiDyOptics(masks, fidelity=Fidelity(window=window), lens=LENS)
-    psi = optics.defocus(depth)
+    psi = optics.camera.defocus(depth)
     field = optics.psf_model.field_of(size)
     assert field is not None
     bank = optics.psf_model.scene_bank(3, image.dtype, psi, field=field)

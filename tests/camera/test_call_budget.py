@@ -21,11 +21,11 @@ PACKAGE = Path(kornia_tidy.__file__).parent
 
 # Functions, files and depth at most. Counted are what a reader of such a capture meets, the backward pass too.
 LIMITS = {
-    "flat": (48, 17, 8),
-    "leaves": (48, 17, 8),
-    "gradient": (91, 28, 11),
-    "new scene": (79, 25, 12),
-    "wide lens": (71, 24, 12),
+    "flat": (41, 16, 8),
+    "leaves": (41, 16, 8),
+    "gradient": (85, 26, 11),
+    "new scene": (73, 24, 12),
+    "wide lens": (65, 23, 12),
 }
 
 Call = tuple[str, str, int]  # file, function, and how many functions of ours are called in one another

@@ -70,7 +70,7 @@ class TestLensCaptures(BaseTester):
             bank = optics.psf_bank(field=[place(optics, image, (y, x))])
             axis, light = PSFBank(bank.psfs[0], bank.defocus, bank.energy[0]), bank.light[0, :, :].mean(0)
             options = {"compositing": compositing, "border": border}
-            own = render(image, optics.defocus(depth), axis, **options)[0, :, y - margin, x - margin]
+            own = render(image, optics.camera.defocus(depth), axis, **options)[0, :, y - margin, x - margin]
             own = own * light if compositing == "occlusion" else own  # whose PSFs are normalised
             lost.append((own - seen[0, :, y - margin, x - margin]).abs().max())
         assert float(torch.stack(lost).max()) < 1e-3  # of full scale
@@ -83,7 +83,7 @@ class TestLensCaptures(BaseTester):
             points[..., y, x] = 1
             seen = pad(optics(points, depth), (8,) * 4)[..., y : y + 17, x : x + 17]
             psfs = optics.psf_bank(field=[place(optics, image, (y, x))]).psfs[0]
-            nodes, psi = torch.tensor(optics.defocus_nodes), optics.defocus(depth)[0, 0, y, x]
+            nodes, psi = torch.tensor(optics.defocus_nodes), optics.camera.defocus(depth)[0, 0, y, x]
             below = int((nodes <= psi).sum().clamp(1, len(nodes) - 1)) - 1
             share = (psi - nodes[below]) / (nodes[below + 1] - nodes[below])
             psf = torch.lerp(psfs[below], psfs[below + 1], share)
@@ -202,7 +202,7 @@ class TestLensCaptures(BaseTester):
         assert field.nodes == (1, 1)
         image, depth = scene(24, 24)
         axis = optics.psf_bank(field=[(0.0, 0.0)])
-        same = render(image, optics.defocus(depth), PSFBank(axis.psfs[0], axis.defocus, axis.energy[0]))
+        same = render(image, optics.camera.defocus(depth), PSFBank(axis.psfs[0], axis.defocus, axis.energy[0]))
         self.assert_close(optics(image, depth), same, rtol=0, atol=1e-3)
 
     @pytest.mark.takes_seconds

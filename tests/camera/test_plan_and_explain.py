@@ -21,7 +21,7 @@ class TestExplain(BaseTester):
             PixelwiseMask(1), fidelity=Fidelity(window=23), compositing=compositing, color_space="linear", sensor=None
         )
         image, depth = _scene()
-        explanation, psi = optics.explain(image, depth), optics.defocus(depth)
+        explanation, psi = optics.explain(image, depth), optics.camera.defocus(depth)
         assert set(explanation.works) | set(explanation.objections) == set(dispatch.BACKENDS)
         assert str(explanation).startswith(f"{explanation.scene}: {explanation.backend}")
         with torch.no_grad():

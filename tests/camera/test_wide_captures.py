@@ -39,7 +39,7 @@ class TestWideCaptures(BaseTester):
     @torch.no_grad()
     def test_feature_captures_agree_with_exact_psfs_of_each_depth(self):
         optics, image, depth = fast_camera(), light(128), stairs()
-        psi = optics.defocus(depth)
+        psi = optics.camera.defocus(depth)
         nodes = sorted(psi.unique().tolist())
         psfs = exact_psf_bank(
             torch.zeros(1, 23, 23), torch.ones(1), optics.pupil, Spectrum.monochrome(), [1.0], nodes,

@@ -16,16 +16,15 @@ from kornia_tidy.kernels import (
     mutual_intensity_ops,
     occlusion_ops,
     overlap_ops,
+    pixel_ops,
     scattered_ops,
-    sensor_ops,
-    srgb_ops,
 )
 from kornia_tidy.kernels.build import build
 from kornia_tidy.kernels.compiler import NotBuiltError
 from tests.base import BaseTester
 from tests.kernels.kernel_shapes import Call
 
-MODULES = (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, scattered_ops, srgb_ops, sensor_ops)
+MODULES = (gather_ops, overlap_ops, occlusion_ops, mutual_intensity_ops, scattered_ops, pixel_ops)
 MISSING = next((why for m in MODULES if (why := build(m.SOURCE, torch.float32).remark)), "")
 needs_compiler = pytest.mark.skipif(
     any(build(m.SOURCE, torch.float32).library is None for m in MODULES), reason=f"no compiled code: {MISSING}"

@@ -73,7 +73,7 @@ class TestMeasuredField(BaseTester):
             alone = PSFBank(own.psfs[0], own.defocus, own.energy[0])
             if compositing == "occlusion":
                 alone = alone.with_tails() if optics.psf_model.measured_cut else alone
-            expected = render(image, optics.defocus(depth), alone, compositing=compositing, border=optics.border)
+            expected = render(image, optics.camera.defocus(depth), alone, compositing=compositing, border=optics.border)
             expected = expected * own.light[0, 0, 0] if compositing == "occlusion" else expected
             assert float((expected - seen)[0, 0, pixel[0], pixel[1]].abs()) < error
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from scipy import stats
 
-from kornia_tidy.kernels import sensor_ops
-from kornia_tidy.kernels.sensor_ops import SOURCE, record
+from kornia_tidy.kernels import pixel_ops
+from kornia_tidy.kernels.pixel_ops import SOURCE, record
 from kornia_tidy.sensor import SensorNoise
 from tests.base import BaseTester
 from tests.kernels import kernel_shapes
@@ -31,7 +31,7 @@ def by_torch(monkeypatch):
 
     def made(sensor, light, params):
         with monkeypatch.context() as patch:
-            patch.setattr(sensor_ops, "compiled", lambda source, dtype: None)
+            patch.setattr(pixel_ops, "compiled", lambda source, dtype: None)
             return sensor(light, params)
 
     return made

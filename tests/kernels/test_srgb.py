@@ -8,15 +8,15 @@ import pytest
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 
-from kornia_tidy.kernels import srgb_ops
-from kornia_tidy.kernels.srgb_ops import SOURCE, linear_to_srgb, srgb_to_linear
+from kornia_tidy.kernels import pixel_ops
+from kornia_tidy.kernels.pixel_ops import SOURCE, decode, encode
 from tests.base import BaseTester
 from tests.kernels import kernel_shapes
 from tests.kernels.kernel_shapes import srgb_by_definition
 from tests.kernels.operator_tester import OperatorTester, needs_compiler
 
 JOINTS = {False: 0.04045, True: 0.0031308}
-PAIRS = {False: (srgb_to_linear, rgb_to_linear_rgb), True: (linear_to_srgb, linear_rgb_to_rgb)}
+PAIRS = {False: (decode, rgb_to_linear_rgb), True: (encode, linear_rgb_to_rgb)}
 
 
 class TestSRGB(OperatorTester):
@@ -89,7 +89,7 @@ class TestConversions(BaseTester):
         assert torch.equal(ours(x), ours(x.contiguous()))
 
     def test_feature_without_a_compiler_it_is_what_kornia_does(self, encode, monkeypatch):
-        monkeypatch.setattr(srgb_ops, "compiled", lambda source, dtype: None)
+        monkeypatch.setattr(pixel_ops, "compiled", lambda source, dtype: None)
         ours, theirs = PAIRS[encode]
         x = torch.rand(2, 3, 5, 7)
         assert torch.equal(ours(x), theirs(x))
