@@ -45,7 +45,7 @@ typedef struct {
     const REAL *veil;   // (layers, channels) share of stray light
     REAL *out;          // (images, channels, height, width)
     const REAL *gradient;  // of `out`
-    REAL *psf_gradient, *veil_gradient;  // of `psfs` and `veil`, like them
+    REAL *psf_gradient, *veil_gradient, *plane_gradient, *mean_gradient;  // of the tensors, like them, or null
     field over;         // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
 } scene_parameters;
 
@@ -660,19 +660,26 @@ int occlude(const scene_parameters *s) {
     return failed;
 }
 
-// ---- Gradients of the PSFs and of stray light. Each block is rendered again.
+// ---- Gradients of the light, of the PSFs and of stray light. Each block is rendered again.
 
 enum { LINES = 4, SPAN = REGISTERS / 8 };  // rows of a PSF, and vectors of each, whose sums stay in registers
 
 // Gradients of a thread, by layer and channel.
 typedef struct {
-    double *tables, *psfs, *veil;
+    double *tables, *psfs, *veil, *mean;
+    REAL *light;  // of the plane
+    REAL *rows;   // of a window, which a block's light is spread to, by
+    REAL *psf;    // a PSF with BAND - 1 zeros above and below it, columns first
     REAL *band;  // of PSFs, (LINES side / LINES, pitch) rounded up, of the blocks of one band
     char *met;   // whether a block of the band has the layer
     int64_t pitch, size;
     lines lines;  // of a row of tiles, and
     vec *nodes;   // of all of them, with PSFs over the field
 } tally;
+
+static int64_t plane_numbers(const scene_parameters *s) {
+    return s->images * s->channels * (s->height + s->side - 1) * (s->width + s->side - 1);
+}
 
 static int allocate_tally(const scene_parameters *s, tally *t) {
     const int64_t planes = s->layers * s->channels, area = s->side * s->side;
@@ -681,16 +688,20 @@ static int allocate_tally(const scene_parameters *s, tally *t) {
     t->tables = calloc(planes * (table_size(s) + area + 1), sizeof(double));
     t->psfs = t->tables + planes * table_size(s), t->veil = t->psfs + planes * area;
     t->band = calloc(planes * t->size, sizeof(REAL));
+    t->mean = calloc(s->images * s->channels, sizeof(double));
+    t->light = calloc(s->plane_gradient ? plane_numbers(s) : 1, sizeof(REAL));
+    t->rows = malloc((s->side + BAND - 1) * window_pitch(s) * sizeof(REAL));
+    t->psf = calloc(s->side * (s->side + 2 * BAND - 2), sizeof(REAL));
     t->met = calloc(s->layers, 1);
     const int taken = take_lines(&s->over, planes, area, &t->lines);
     const int64_t vectors = s->over.node_rows * s->over.node_columns * planes * t->lines.vectors;
     t->nodes = aligned_alloc(sizeof(vec), (vectors + 1) * sizeof(vec));
     if (t->nodes) memset(t->nodes, 0, vectors * sizeof(vec));
-    return taken && t->tables && t->band && t->met && t->nodes;
+    return taken && t->tables && t->band && t->mean && t->light && t->rows && t->psf && t->met && t->nodes;
 }
 
 static void free_tally(tally *t) {
-    free(t->tables), free(t->band), free(t->met), free(t->nodes);
+    free(t->tables), free(t->band), free(t->mean), free(t->light), free(t->rows), free(t->psf), free(t->met), free(t->nodes);
     free_lines(&t->lines);
 }
 
@@ -808,12 +819,13 @@ static void turn_back(const scene_parameters *s, workspace *d, tally *t, const b
         for (int n = b->layers - 1; n >= 0; n--) {
             const int64_t plane = d->members[n] * s->channels + c;
             const REAL veil = s->veil ? s->veil[plane] : 0, mean = s->veil ? s->mean[b->image * s->channels + c] : 0;
-            vec(*k)[BAND] = d->kept[n * s->channels + c], of_veil = {0};
+            vec(*k)[BAND] = d->kept[n * s->channels + c], of_veil = {0}, of_mean = {0};
             for (int v = 0; v < BAND; v++) {
                 const vec lit = s->over.node_rows ? k[LIT][v] : all(1), blurred = k[BLURRED][v], light = lit * blurred;
                 vec own = k[ALPHA][v], divisor = k[DIVISOR][v], passed = k[PASSED][v];
                 vec of_passed = gradient[v] * ((1 - veil) * light + veil * mean * own) - through[c][v] * own;
                 of_veil += gradient[v] * passed * (mean * own - light);
+                of_mean += gradient[v] * passed * own;
                 k[BLURRED][v] = (1 - veil) * gradient[v] * passed * lit;
                 k[LIT][v] = (1 - veil) * gradient[v] * passed * blurred;
                 k[ALPHA][v] = passed * (veil * mean * gradient[v] - through[c][v]);
@@ -821,6 +833,7 @@ static void turn_back(const scene_parameters *s, workspace *d, tally *t, const b
                 through[c][v] += of_passed / divisor;
             }
             t->veil[plane] += sum_of(of_veil);
+            t->mean[b->image * s->channels + c] += veil * sum_of(of_mean);
         }
     }
 }
@@ -861,7 +874,36 @@ static void add_over_field(const scene_parameters *s, workspace *d, tally *t, co
     spread_tile(&t->lines, plane, b->columns.tile, d->psf);
 }
 
-// Adds the gradients of the PSFs from those of the planes that they have blurred.
+// Adds the gradient of a layer's light, which was found, to that of the plane: the transpose of find_light and convolve_one.
+// Neighbours in a row are added one round after the other, when what was stored is in memory.
+static void spread_light(const scene_parameters *s, workspace *d, tally *t, const block *b, int32_t layer, int64_t c,
+                         const vec *light) {
+    const int64_t side = s->side, rows = side + BAND - 1, height = rows + BAND - 1, pitch = window_pitch(s);
+    const REAL *psf = s->psfs + (layer * s->channels + c) * side * side;
+    for (int64_t j = 0; j < side; j++) memcpy(t->psf + j * height + BAND - 1, psf + j * side, side * sizeof(REAL));
+    memset(t->rows, 0, rows * pitch * sizeof(REAL));
+    for (int64_t lane = 0; lane < LANES; lane++)
+        for (int64_t r = 0; r < rows; r++) {
+            const int64_t from = d->rays[r].from, first = from + (lane + LANES - from % LANES) % LANES;
+            for (int64_t j = first; j < d->rays[r].to; j += LANES) {
+                REAL *to = t->rows + r * pitch + j;
+                vec sum = *(const loose *)to;
+#pragma GCC unroll 8
+                for (int v = 0; v < BAND; v++) sum += t->psf[j * height + r + BAND - 1 - v] * light[v];
+                *(loose *)to = sum;
+            }
+        }
+    for (int64_t r = 0; r < rows; r++) {
+        const REAL *lower = b->lower + r * s->map_row, *share = b->share ? b->share + r * s->map_row : 0;
+        REAL *to = t->light + b->light + c * s->plane_channel + r * s->plane_row;
+        for (int64_t x = 0; d->rays[r].to && x < side + LANES - 1; x++) {
+            const REAL next = share ? share[x] : 0;
+            to[x] += (lower[x] == layer ? 1 - next : lower[x] == layer - 1 ? next : 0) * t->rows[r * pitch + x];
+        }
+    }
+}
+
+// Adds the gradients of light and PSFs from those of the planes that the PSFs have blurred.
 static void add_layers(const scene_parameters *s, workspace *d, tally *t, const block *b) {
     for (int n = 0; n < b->layers; n++) {
         const int32_t layer = d->members[n];
@@ -870,6 +912,8 @@ static void add_layers(const scene_parameters *s, workspace *d, tally *t, const 
         for (int64_t c = 0; c < s->channels; c++) {
             const int64_t plane = layer * s->channels + c;
             find_light(s, d, b, layer, c);
+            if (s->plane_gradient) spread_light(s, d, t, b, layer, c, d->kept[n * s->channels + c][BLURRED]);
+            if (!s->psf_gradient) continue;
             if (s->over.node_rows) add_over_field(s, d, t, b, n, c);
             else add_layer(s, d, t, b, n, c, VALUE, t->band + plane * t->size, t->tables + plane * table_size(s));
         }
@@ -900,7 +944,7 @@ static void go_back(const scene_parameters *s, workspace *d, tally *t, const dou
     memset(t->met, 0, s->layers);
 }
 
-// Computes the gradients of PSFs and stray light from that of the light. Each thread sums bands, always the same ones, and
+// Computes the gradients that are asked for from that of the light; over the field only those of PSFs. Each thread sums bands, always the same ones, and
 // threads are summed in their order. Returns 0, or 1 if there is no memory.
 int occlusion_gradients(const scene_parameters *s) {
     const int64_t bands = s->images * bands_of(s), all = s->layers * s->channels, area = s->side * s->side;
@@ -934,8 +978,17 @@ int occlusion_gradients(const scene_parameters *s) {
     for (int64_t n = 0; !failed && !s->over.node_rows && n < all * (area + 1); n++) {
         double sum = 0;
         for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].psfs[n];  // `veil` follows `psfs`
-        if (n < all * area) s->psf_gradient[n] = sum;
-        else if (s->veil_gradient) s->veil_gradient[n - all * area] = sum;
+        if (n >= all * area && s->veil_gradient) s->veil_gradient[n - all * area] = sum;
+        else if (n < all * area && s->psf_gradient) s->psf_gradient[n] = sum;
+    }
+    for (int64_t n = 0; !failed && s->plane_gradient && n < plane_numbers(s); n++) {
+        s->plane_gradient[n] = tallies->light[n];
+        for (int64_t thread = 1; thread < s->threads; thread++) s->plane_gradient[n] += tallies[thread].light[n];
+    }
+    for (int64_t n = 0; !failed && s->mean_gradient && n < s->images * s->channels; n++) {
+        double sum = 0;
+        for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].mean[n];
+        s->mean_gradient[n] = sum;
     }
     for (int64_t thread = 0; tallies && thread < s->threads; thread++) free_tally(tallies + thread);
     free(tables), free(tallies);

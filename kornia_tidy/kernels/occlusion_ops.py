@@ -1,7 +1,7 @@
 """Operator of occlusion by direct convolution: in C.
 
 Sums are of positive terms only, so float32 keeps their relative accuracy however small the divisor that they become.
-A second operator makes the gradients of PSFs and stray light. Those of light and layers the renderer makes by tiles.
+A second operator makes the gradients of light, PSFs and stray light. Those of the layers the renderer makes by tiles.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def occlusion_direct_gradients(
     inside: Tensor | None,
     gradient: Tensor,
     places: Sequence[Tensor] = (),
+    wanted: Sequence[bool] = (False, True, False, True),
 ) -> list[Tensor]:
     """Return gradients of :func:`occlusion_direct`: operator ``kornia_tidy::occlusion_direct_gradients``.
 
@@ -94,18 +95,19 @@ def occlusion_direct_gradients(
         inside: as there.
         gradient: (B, C, H, W) of the light, of the plane's dtype.
         places: as there.
+        wanted: which gradients: of the plane, of the PSFs, of ``mean`` and of ``stray_light``.
 
     Returns:
-        The gradient of the PSFs and, where there is stray light, that of ``stray_light``. They have none.
+        The gradients wanted of the tensors that are not None. They have none.
 
     Raises:
         TypeError: as there.
-        ValueError: as there, or if the gradient does not fit.
+        ValueError: as there, or if the gradient does not fit, or more than that of the PSFs is wanted with ``places``.
         MemoryError: as there.
         NotBuiltError: as there.
     """
     scene = plane, psfs, layer_index, layer_weight, mean, stray_light, inside
-    return torch.ops.kornia_tidy.occlusion_direct_gradients(*scene, list(places), gradient)
+    return torch.ops.kornia_tidy.occlusion_direct_gradients(*scene, list(places), gradient, list(wanted))
 
 
 def count_operations(
@@ -153,7 +155,7 @@ class _Scene(Parameters):
         *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
         *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "map_image", "map_row")),
         *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "mean", "stray_light", "out")),
-        *((name, ctypes.c_void_p) for name in ("gradient", "psf_gradient", "stray_light_gradient")),
+        *((name, ctypes.c_void_p) for name in ("gradient", "of_psfs", "of_stray_light", "of_plane", "of_mean")),
         *PLACES,
     )
 
@@ -228,27 +230,39 @@ def _occlude(*scene: Any) -> Tensor:
     return light
 
 
-def _new_gradients(*scene_and_gradient: Any) -> list[Tensor]:
-    *scene, gradient = scene_and_gradient
+_WITH_GRADIENTS = {"plane": 0, "psfs": 1, "mean": 4, "stray_light": 5}  # names, and places among the arguments
+
+
+def _new_gradients(*given: Any) -> list[Tensor]:
+    *scene, gradient, wanted = given
     light = _new_light(*scene)
     check_dtypes(light, gradient=gradient)
     check_shape("gradient", gradient, tuple(light.shape))
-    psfs, stray_light = scene[1], scene[5]
-    return [x.new_empty(x.shape) for x in (psfs, stray_light) if x is not None]
+    if scene[-1] and (wanted[0] or wanted[2]):
+        raise ValueError("places must be empty where the gradient of the plane or of its mean is wanted")
+    tensors = (scene[n] for n in _WITH_GRADIENTS.values())
+    return [x.new_empty(x.shape) for x, want in zip(tensors, wanted, strict=True) if want and x is not None]
 
 
-def _gradients(*scene_and_gradient: Any) -> list[Tensor]:
-    *scene, gradient = scene_and_gradient
-    found, parameters = _new_gradients(*scene_and_gradient), _parameters(*scene)
-    of_psfs, *of_stray_light = found
-    side, extra = of_psfs.shape[-1], (parameters.side - of_psfs.shape[-1]) // 2
-    columns = of_psfs.new_empty(*of_psfs.shape[:-2], parameters.side, parameters.side)
-    parameters.point_to(gradient=gradient, psf_gradient=columns)
-    if of_stray_light:
-        parameters.point_to(stray_light_gradient=of_stray_light[0])
-    if load(SOURCE, columns.dtype).occlusion_gradients(ctypes.byref(parameters)):
+def _gradients(*given: Any) -> list[Tensor]:
+    *scene, gradient, wanted = given
+    found, parameters = _new_gradients(*given), _parameters(*scene)
+    extra = (parameters.side - scene[1].shape[-1]) // 2
+    parts = zip(_WITH_GRADIENTS.items(), wanted, strict=True)
+    names = [name for (name, n), want in parts if want and scene[n] is not None]
+    own = {"gradient": gradient}
+    for name, x in zip(names, found, strict=True):
+        planes = name in {"plane", "psfs"}  # these have a rim where PSFs were padded
+        own[f"of_{name}"] = x.new_empty(*x.shape[:-2], *(n + 2 * extra for n in x.shape[-2:])) if planes else x
+    parameters.point_to(**own)
+    if load(SOURCE, gradient.dtype).occlusion_gradients(ctypes.byref(parameters)):
         raise MemoryError(f"no memory for gradients of PSFs of {parameters.side}x{parameters.side} pixels")
-    of_psfs.copy_(columns.mT.flip((-2, -1))[..., extra : extra + side, extra : extra + side])
+    for name, x in zip(names, found, strict=True):
+        made = own[f"of_{name}"]
+        if name == "psfs":
+            made = made.mT.flip((-2, -1))
+        if made is not x:
+            x.copy_(made[..., extra : extra + x.shape[-2], extra : extra + x.shape[-1]])
     return found
 
 
@@ -257,4 +271,5 @@ _SCENE = (
     " Tensor? inside, Tensor[] places"
 )
 define("occlusion_direct", f"({_SCENE}) -> Tensor", _occlude, _new_light)
-define("occlusion_direct_gradients", f"({_SCENE}, Tensor gradient) -> Tensor[]", _gradients, _new_gradients)
+_GRADIENTS = f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]"
+define("occlusion_direct_gradients", _GRADIENTS, _gradients, _new_gradients)

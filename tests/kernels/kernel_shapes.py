@@ -284,7 +284,24 @@ def _occlude_gradient(drawn: tuple[tuple[Any, ...], LayeredScene, str, int]) -> 
         roundings = psfs.shape[-1] ** 2 + 16 + 8 * gradient.shape[-1]
         return expected, 12 * _occlusion_error(psfs, roundings) * _occlusion_magnitude(planes, gradient.abs())
 
-    return Call(about, "occlusion_direct_gradients", (*arguments, gradient), 3 * products, truth)
+    given = *arguments, gradient, [False, True, False, False]
+    return Call(about, "occlusion_direct_gradients", given, 3 * products, truth)
+
+
+def occlude_light_gradient(draw: random.Random) -> Call:
+    """``occlusion_gradients`` of occlusion.c, that of the light: products of PSFs, weights and what blocks pass on."""
+    arguments, scene, about, products = _occluding(draw)
+    psfs, gradient = arguments[1], torch.randn(*scene.image.shape[:2], *scene.output_size, dtype=arguments[1].dtype)
+
+    def truth() -> tuple[Tensor, Tensor]:
+        planes = occlusion_planes(scene)
+        planes = planes._replace(light=planes.light.double().clone().requires_grad_(), psfs=psfs.double())
+        (expected,) = torch.autograd.grad((occlude_dense(*planes) * gradient).sum(), planes.light)
+        magnitude = _occlusion_magnitude(planes, gradient.abs(), planes.light)
+        return expected, 12 * _occlusion_error(psfs, psfs.shape[-1] ** 2 + 16) * magnitude
+
+    given = *arguments, gradient, [True, False, False, False]
+    return Call(about, "occlusion_direct_gradients", given, 3 * products, truth)
 
 
 def _occlusion_error(psfs: Tensor, roundings: int) -> float:
@@ -292,8 +309,8 @@ def _occlusion_error(psfs: Tensor, roundings: int) -> float:
     return layers * (layers + 1) * apart * gamma(roundings, psfs.dtype)
 
 
-def _occlusion_magnitude(planes: OcclusionPlanes, gradient: Tensor) -> Tensor:
-    """Sums of the magnitudes of all terms of the PSFs' gradient."""
+def _occlusion_magnitude(planes: OcclusionPlanes, gradient: Tensor, of: Tensor | None = None) -> Tensor:
+    """Sums of the magnitudes of all terms of a gradient: of the PSFs, or of another one of the planes."""
     light, psfs, weight, _, _, index, inside = planes
     weight, lit = None if weight is None else weight.double(), 1 if inside is None else inside[:, None]
 
@@ -310,7 +327,7 @@ def _occlusion_magnitude(planes: OcclusionPlanes, gradient: Tensor) -> Tensor:
         share = alpha.detach() / divisor
         terms = blur(own * light, psfs[layer]) + 2 * alpha + 2 * share * seen
         total, passed = total + (gradient * passed / divisor * terms).sum(), passed * (1 - share)
-    return torch.autograd.grad(total, psfs)[0]
+    return torch.autograd.grad(total, psfs if of is None else of)[0]
 
 
 def _occluding(draw: random.Random) -> tuple[tuple[Any, ...], LayeredScene, str, int]:
@@ -474,7 +491,7 @@ def scattered_written_out(
 
 
 def srgb(draw: random.Random) -> Call:
-    """``convert`` of srgb.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
+    """``convert`` of pixels.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
     image, encode, about = _colours(draw)
 
     def truth() -> tuple[Tensor, Tensor]:
@@ -486,7 +503,7 @@ def srgb(draw: random.Random) -> Call:
 
 
 def srgb_gradient(draw: random.Random) -> Call:
-    """``convert`` of srgb.c with a gradient: to 16 roundings of it."""
+    """``convert`` of pixels.c with a gradient: to 16 roundings of it."""
     image, encode, about = _colours(draw)
     gradient = torch.randn_like(image)
 
@@ -545,7 +562,7 @@ class _Recorded:
 
 
 def sensor(draw: random.Random) -> Call:
-    """``record`` of sensor.c."""
+    """``record`` of pixels.c."""
     arguments, about = _sensed(draw)
 
     def truth() -> tuple[Tensor, Tensor]:
@@ -556,7 +573,7 @@ def sensor(draw: random.Random) -> Call:
 
 
 def sensor_gradient(draw: random.Random) -> Call:
-    """``record`` of sensor.c with a gradient."""
+    """``record`` of pixels.c with a gradient."""
     arguments, about = _sensed(draw)
     light, *rest = arguments
     gradient = torch.randn_like(light)
@@ -595,7 +612,7 @@ def _recorded(
     bits: int,
     clip: bool,
 ) -> _Recorded:
-    """The formulas of ``sensor_ops.py`` by SciPy's distributions; the rate is rounded as that of the sensor is."""
+    """The formulas of ``pixel_ops.py`` by SciPy's distributions; the rate is rounded as that of the sensor is."""
     share, eps = gamma(24, light.dtype), torch.finfo(light.dtype).eps
     value, slope, torn = light.double(), torch.ones_like(light).double(), torch.zeros_like(light, dtype=torch.bool)
     off = torch.zeros_like(value)
@@ -704,16 +721,17 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "direct.c: gather": gather,
     "occlusion.c: light": occlude,
     "occlusion.c: gradient": occlude_gradient,
+    "occlusion.c: gradient of the light": occlude_light_gradient,
     "occlusion.c: light over the field": field_occlude,
     "occlusion.c: gradient over the field": field_occlude_gradient,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
     "scattered.c: light": scattered,
     "scattered.c: gradient": scattered_gradient,
-    "srgb.c: values": srgb,
-    "srgb.c: gradient": srgb_gradient,
-    "sensor.c: values": sensor,
-    "sensor.c: gradient": sensor_gradient,
+    "pixels.c: sRGB": srgb,
+    "pixels.c: gradient of sRGB": srgb_gradient,
+    "pixels.c: sensor": sensor,
+    "pixels.c: gradient of the sensor": sensor_gradient,
 }
 
 

@@ -97,9 +97,10 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
     def test_cardinality_tensors_without_memory(self):
         """Of a list, and so not as for the other operators."""
         arguments = kernel_shapes.occlude_gradient(random.Random(1)).arguments
-        *planes, _, gradient = arguments
-        found = occlusion_direct_gradients(*(None if x is None else x.to("meta") for x in (*planes, gradient)))
-        given = [x for x in (arguments[1], arguments[5]) if x is not None]
+        *planes, _, gradient, _ = arguments
+        given = (None if x is None else x.to("meta") for x in (*planes, gradient))
+        found = occlusion_direct_gradients(*given, wanted=[True] * 4)
+        given = [arguments[n] for n in (0, 1, 4, 5) if arguments[n] is not None]
         assert [(x.shape, x.dtype, x.is_meta) for x in found] == [(x.shape, x.dtype, True) for x in given]
 
     def test_dynamo_is_one_node_of_a_whole_graph(self):
@@ -115,7 +116,17 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
         return occlusion_direct_gradients(**scene(), mean=None, stray_light=None, inside=None, gradient=gradient)
 
     @needs_compiler
-    @pytest.mark.parametrize("draw", [kernel_shapes.occlude_gradient, kernel_shapes.field_occlude_gradient])
+    @pytest.mark.parametrize("seed", range(12))
+    def test_feature_of_the_light_within_round_off(self, seed):
+        torch.manual_seed(seed)
+        call = kernel_shapes.occlude_light_gradient(random.Random(seed))
+        assert call.error() <= 1, call.about
+
+    @needs_compiler
+    @pytest.mark.parametrize(
+        "draw",
+        [kernel_shapes.occlude_gradient, kernel_shapes.occlude_light_gradient, kernel_shapes.field_occlude_gradient],
+    )
     @pytest.mark.parametrize("threads", [1, 3, 50])
     def test_feature_the_same_every_time_with_as_many_threads(self, threads, draw):
         before, call = torch.get_num_threads(), draw(random.Random(3))

@@ -3,8 +3,8 @@
 Small PSFs are convolved sample by sample and discs run by run (``direct.c``), other ones by transforms of overlapping
 windows (``overlap.c``), each block or window with only the PSFs of its layers. Occlusion is convolved directly
 (``occlusion.c``): all that is added up is positive, so float32 is enough, as the relative error of every sum is small,
-however small the normaliser that it becomes. Gradients of its PSFs and stray light are made in the same way, those of
-image and depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kernels.build`.
+however small the normaliser that it becomes. Gradients of image, PSFs and stray light are made in the same way, that of
+depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kernels.build`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from kornia_tidy.kernels.build import REALS, compiled
 from kornia_tidy.kernels.gather_ops import count_terms, gather_direct
 from kornia_tidy.kernels.occlusion_ops import occlusion_direct, occlusion_direct_gradients
 from kornia_tidy.kernels.overlap_ops import gather_overlap, overlap_psf_gradient, scatter_overlap, window_size
-from kornia_tidy.render.backend import GradientPairs, Work, gradient_pairs, transform_operations, wants_gradient
+from kornia_tidy.render.backend import GradientPairs, Work, transform_operations, wants_gradient
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend
@@ -159,15 +159,16 @@ class _Sums:
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-    """Return the gradients of PSFs and stray light directly; with those of image or depth all by transforms."""
+    """Return the gradients directly; with those of depth, or over the field of light, all by transforms."""
     planes = _occlusion(scene)
     light, psfs, _, weight, mean, stray_light, _, places = planes
-    if any(wants_gradient(x) for x in (light, weight, mean)):
+    tensors = light, psfs, mean, stray_light
+    wanted = [wants_gradient(x) for x in tensors]
+    if wants_gradient(weight) or (places and wanted[0]):
         return (BatchedBackend() if scene.field is None else DenseBackend()).gradients(scene, gradient)
     with torch.no_grad():
-        found = occlusion_direct_gradients(*planes[:-1], gradient, places)
-    pairs = gradient_pairs((psfs, stray_light), (*found, None)[:2])
-    return [(tensor, own) for tensor, own in pairs if tensor.requires_grad]
+        found = occlusion_direct_gradients(*planes[:-1], gradient, places, wanted)
+    return list(zip((x for x, want in zip(tensors, wanted, strict=True) if want and x is not None), found, strict=True))
 
 
 def _occlusion(scene: LayeredScene) -> tuple[Any, ...]:
