@@ -15,21 +15,24 @@ from types import FrameType
 
 import pytest
 
+Calls = dict[str, tuple[float, list[str]]]  # of each test: seconds, and the functions that it calls
+
 
 class CallRecorder:
-    """Writes ``{test: [seconds, [file:function, ...]]}`` of the tests that passed.
+    """Writes a line ``[test, [seconds, [file:function, ...]]]`` for each test that passes.
 
     Args:
         root: of the checkout.
-        path: JSON file, written at the end.
+        path: file of lines of JSON, which gets this name at the end. A run that was cut short goes on where it stopped.
     """
 
     def __init__(self, root: Path, path: Path) -> None:
         self._prefix = f"{root / 'kornia_tidy'}/"
         self._skip = len(f"{root}/")
         self._path = path
+        self._part = path.with_suffix(".part")
         self._called: set[str] = set()
-        self._tests: dict[str, tuple[float, list[str]]] = {}
+        self._known = read_calls(self._part) if self._part.exists() else {}
 
     def _watch(self, frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
@@ -47,7 +50,8 @@ class CallRecorder:
         sys.settrace(None)
         threading.settrace(None)  # type: ignore[arg-type]
         if not getattr(item, "was_left_out", False):
-            self._tests[item.nodeid] = (time.perf_counter() - begin, sorted(self._called))
+            with self._part.open("a") as file:
+                file.write(json.dumps((item.nodeid, (time.perf_counter() - begin, sorted(self._called)))) + "\n")
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[None]:
@@ -56,6 +60,16 @@ class CallRecorder:
         if not outcome.get_result().passed:  # type: ignore[attr-defined]
             item.was_left_out = True  # type: ignore[attr-defined]
 
-    def pytest_sessionfinish(self) -> None:
-        """Write the file."""
-        self._path.write_text(json.dumps(self._tests))
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Leave out tests that an earlier run recorded."""
+        items[:] = [item for item in items if item.nodeid not in self._known]
+
+    def pytest_sessionfinish(self, exitstatus: int) -> None:
+        """Name the file, unless the run was cut short."""
+        if exitstatus in {pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED}:
+            self._part.rename(self._path)
+
+
+def read_calls(path: Path) -> Calls:
+    """Return what a :class:`CallRecorder` wrote."""
+    return dict(json.loads(line) for line in path.read_text().splitlines())

@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-PACKAGES = ("psf", "render", "kernels", "camera", "sensor", "accuracy")
+HEART = ("psf", "render", "kernels", "camera", "sensor", "accuracy")
+SETS = ("heart", "others")  # these packages, and all other files of the package
 KINDS = ("sign", "off-by-one", "unit", "gradient", "memory", "condition")
 
 
@@ -49,19 +50,22 @@ class Mutant:
         return f"{self.path}:{self.line} {self.kind}: {old[:80]!r} -> {' '.join(self.new.split())[:80]!r}"
 
 
-def draw_mutants(root: Path, count: int, seed: int) -> list[Mutant]:
+def draw_mutants(root: Path, set_: str, count: int, seed: int) -> list[Mutant]:
     """Return different mutants of a checkout; fewer from the same seed are the first of them.
 
     The kinds take turns. A file is drawn by its number of lines, then one of its places for the kind.
 
     Args:
         root: the checkout.
+        set_: one of :data:`SETS`.
         count: how many.
         seed: of the draw.
     """
     random_ = random.Random(seed)
-    files = [path for name in PACKAGES for path in sorted((root / "kornia_tidy" / name).rglob("*"))]
-    found = {path: mutants_of(path.relative_to(root).as_posix(), path.read_bytes()) for path in files if is_code(path)}
+    package = root / "kornia_tidy"
+    files = [p for p in sorted(package.rglob("*")) if is_code(p)]
+    files = [p for p in files if (p.relative_to(package).parts[0] in HEART) == (set_ == "heart")]
+    found = {path: mutants_of(path.relative_to(root).as_posix(), path.read_bytes()) for path in files}
     lines = [len(path.read_bytes().splitlines()) for path in found]
     drawn: dict[Mutant, None] = {}
     while len(drawn) < count:

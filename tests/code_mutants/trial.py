@@ -18,18 +18,17 @@ from typing import NoReturn
 
 import pytest
 
+from tests.code_mutants.calls import Calls
 from tests.code_mutants.mutants import Mutant
 
-SECONDS = 300  # processor time for the tests of a mutant; longer means a hang
+SECONDS = 120  # processor time for the tests of a mutant; longer means a hang
 PATIENCE = 5  # seconds by the clock for each of the processor: other work may slow it
-ONE_TEST = 100  # seconds by the clock for one test
-TESTS = 45.0  # seconds of tests, as they take without a mutation, that a mutant is shown to
-SETTLED = 6.0  # seconds of tests in the first run, which catches most mutants
+ONE_TEST = 60  # seconds by the clock for one test
+TESTS = 20.0  # seconds of tests, as they take without a mutation, that a mutant is shown to
+SETTLED = 5.0  # seconds of tests in the first run, which catches most mutants
 MEMORY = 9 << 30  # bytes of address space
 REWRITTEN = "ignore:Module already imported:pytest.PytestAssertRewriteWarning"  # before the fork
 OPTIONS = ("-q", "-n0", "-p", "no:cacheprovider", "--tb=line", "--no-header", "-W", REWRITTEN)
-
-Calls = dict[str, tuple[float, list[str]]]  # of each test: seconds, and the functions that it calls
 
 
 @dataclass(frozen=True)
