@@ -21,7 +21,7 @@ import pytest
 from tests.code_mutants.calls import Calls
 from tests.code_mutants.mutants import Mutant
 
-SECONDS = 120  # processor time for the tests of a mutant; longer means a hang
+SECONDS = 60  # processor time for the tests of a mutant; longer means a hang
 PATIENCE = 5  # seconds by the clock for each of the processor: other work may slow it
 ONE_TEST = 60  # seconds by the clock for one test
 TESTS = 20.0  # seconds of tests, as they take without a mutation, that a mutant is shown to

@@ -82,15 +82,16 @@ class TestRenderOverField(BaseTester):
             found.append(torch.autograd.grad(seen, psfs, gradient)[0])
         self.assert_close(*found, rtol=0, atol=1e-12 * float(found[1].abs().max()))
 
-    def test_feature_light_and_defocus_have_gradients_behind_what_hides(self):
+    @pytest.mark.parametrize("border", ["reflect", "zero"])
+    def test_feature_light_and_defocus_have_gradients_behind_what_hides(self, border):
         """By cells: with one node they see what tiles see."""
         field = Field(SIZE, (1, 1))
         bank = bright(bank_over(field))
-        leaves, rendering = [x.requires_grad_() for x in scene_of()], Rendering("occlusion", "reflect")
+        leaves, rendering = [x.requires_grad_() for x in scene_of()], Rendering("occlusion", border)
         seen = render_over_field(*leaves, bank, field, rendering)
         options = {"method": "compiled", "field": field, "layers": "linear", "correlate": False}
         given = *leaves, bank.defocus, bank.with_all_light().psfs, None
-        expected = render_layers(*given, compositing="occlusion", border="reflect", **options)
+        expected = render_layers(*given, compositing="occlusion", border=border, **options)
         self.assert_close(seen, expected, rtol=0, atol=1e-6)  # the divisors have another EPSILON
         for one, other in zip(*(torch.autograd.grad(x.square().sum(), leaves) for x in (seen, expected)), strict=True):
             self.assert_close(one, other, rtol=0, atol=1e-4 * float(other.abs().max()))

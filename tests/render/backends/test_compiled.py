@@ -108,7 +108,7 @@ class TestCompiledRender(RenderTester):
 
     def test_feature_rows_of_any_stride(self, device):
         """Images and maps that lie in memory otherwise than row by row, and maps that are shared by a batch."""
-        bank = make_bank(4, 3, 5, device=device)
+        bank = make_bank(4, 2, 5, device=device)
         image, defocus = make_scene(bank, 2, 24, 40)
         expected = render(image, defocus[:1], bank, method="compiled")
         image = image.to(memory_format=torch.channels_last)
