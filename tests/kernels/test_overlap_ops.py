@@ -91,11 +91,16 @@ class TestGatherOverlap(LayeredSceneTester):
         self.assert_close(large, small, rtol=0, atol=1e-13)
 
     @needs_compiler
-    def test_feature_threads_change_no_bit(self):
+    @pytest.mark.parametrize("field", [False, True])
+    def test_feature_threads_change_no_bit(self, field):
         before, got = torch.get_num_threads(), []
-        given = scene(plane=torch.randn(2, 2, 82, 93, dtype=torch.float64), layer_weight=None)
-        given["layer_index"] = torch.randint(3, (2, 80, 91))
-        spread = {**given, "pixels": torch.randn(2, 2, 80, 91, dtype=torch.float64)}
+        if field:
+            given, light = over_field(plane=torch.randn(2, 2, 6, 19, dtype=torch.float64)), pixels()
+        else:
+            given = scene(plane=torch.randn(2, 2, 82, 93, dtype=torch.float64), layer_weight=None)
+            given["layer_index"] = torch.randint(3, (2, 80, 91))
+            light = torch.randn(2, 2, 80, 91, dtype=torch.float64)
+        spread = {**given, "pixels": light}
         del spread["plane"]
         try:
             for threads in (1, 2, 3):
@@ -163,22 +168,6 @@ class TestGatherOverField(SceneOperatorTester):
 
     def smallest(self):
         return gather_overlap(**over_field())
-
-    @needs_compiler
-    def test_feature_threads_change_no_bit(self):
-        before, got = torch.get_num_threads(), []
-        given = over_field(plane=torch.randn(2, 2, 6, 19, dtype=torch.float64))
-        spread = {**given, "pixels": pixels()}
-        del spread["plane"]
-        try:
-            for threads in (1, 2, 3):
-                torch.set_num_threads(threads)
-                got.append((gather_overlap(**given), scatter_overlap(**spread)))
-        finally:
-            torch.set_num_threads(before)
-        for gathered, scattered in got[1:]:
-            assert torch.equal(gathered, got[0][0])
-            assert torch.equal(scattered, got[0][1])
 
     @pytest.mark.parametrize(
         ("changes", "words"),

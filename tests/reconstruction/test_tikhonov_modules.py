@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from kornia_tidy import PSFBank
+from kornia_tidy.reconstruction import Wiener
 from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers, tikhonov, tikhonov_layers
 from tests.base import BaseTester
 from tests.reconstruction.banks import make_bank, make_psfs
@@ -23,7 +24,7 @@ class TestPrecision(BaseTester):
         """Black captures, and PSFs that pass nothing."""
         psfs = torch.zeros(2, 1, 3, 3, device=device, requires_grad=True)
         bank = PSFBank(psfs, torch.arange(2.0, device=device), torch.zeros(2, 1, device=device))
-        for module in (Tikhonov().to(device), TikhonovLayers().to(device)):
+        for module in (Tikhonov().to(device), TikhonovLayers().to(device), Wiener().to(device)):
             out = module(torch.zeros(1, 1, 6, 6, device=device), bank)
             assert (out == 0).all()
             for gradient in torch.autograd.grad(out.sum(), [psfs, module.log_weight]):

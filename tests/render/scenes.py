@@ -46,6 +46,35 @@ def squares(bank: Bank, height: int, width: int, side: int = 11) -> Tensor:
     return bank.defocus[((y * 3 + x * 5) % len(bank.defocus)).to(bank.defocus.device)][None, None]
 
 
+HARD = ("one layer", "checkerboard", "half way", "slope", "steep ramp", "squares", "speck", "noise", "columns")
+
+
+def hard_depth(kind: str, bank: Bank, height: int, width: int) -> Tensor:
+    """Return a defocus map that is hard on tiles, (1, 1, H, W).
+
+    But for a slope, and half way between layers, it is at the bank's nodes in one half of the picture and between them
+    in the other: pixels of two layers beside those of one.
+    """
+    nodes, count = bank.defocus, len(bank.defocus)
+    y, x = torch.arange(height)[:, None], torch.arange(width)
+    if kind == "slope":
+        return nodes[0] + (nodes[-1] - nodes[0]) * (x / width).to(nodes).expand(1, 1, height, width)
+    label = {
+        "one layer": torch.full((height, width), 2),
+        "checkerboard": y * 3 + x,
+        "half way": y // 3 + x,
+        "steep ramp": (y + 2 * x) * count // (height + 2 * width),
+        "squares": y // 11 * 3 + x // 13 * 5,
+        "speck": 1 + 3 * ((y == height // 2) & (x == width // 3)).long(),
+        "noise": torch.randint(count, (height, width)),
+        "columns": (x % 2 * 3).expand(height, width),
+    }[kind] % count
+    if kind == "half way":
+        return (nodes[label] + nodes[(label + 1).clamp(max=count - 1)])[None, None] / 2
+    psi = nodes[label][None, None]
+    return psi + torch.where(x < width // 2, 1.5 * torch.rand(height, width), 0).to(psi)
+
+
 def modelled(image: Tensor, defocus: Tensor, bank: Bank, compositing: str, border: str) -> Tensor:
     """Return what tests/oracle makes of the first scene of a batch with nearest layers."""
     weights = oracle.layer_weights(defocus[0, 0].numpy(), bank.defocus.tolist(), "nearest")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -12,7 +14,7 @@ from kornia_tidy.render.backends.dense_occlusion import EPSILON, cumulative_weig
 from kornia_tidy.render.borders import BORDERS
 from tests.base import BaseTester
 from tests.render.render_tester import METHODS
-from tests.render.scenes import Bank, make_bank, make_scene, squares
+from tests.render.scenes import Bank, hard_depth, make_bank, make_scene, squares
 
 
 class TestOcclusion(BaseTester):
@@ -64,11 +66,10 @@ class TestOcclusion(BaseTester):
         psfs = torch.rand(6, 1, 15, 15, device=device, dtype=torch.float64) ** 12
         bank = Bank(psfs / psfs.sum((-2, -1), keepdim=True), make_bank(6, device=device).defocus)
         image, _ = make_scene(bank, 1, 70, 80)
-        defocus = squares(bank, 70, 80)
         single = Bank(bank.psfs.float(), bank.defocus.float())
-        expected = render(image, defocus, bank, "occlusion", layers="nearest", method="dense")
-        for method in METHODS:
-            coded = render(image.float(), defocus.float(), single, "occlusion", layers="nearest", method=method)
-            self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)
-
-    # What is skipped, shared and shaped
+        for kind, layers in product(("squares", "steep ramp", "speck"), ("nearest", "linear")):
+            defocus = hard_depth(kind, bank, 70, 80).float()
+            expected = render(image, defocus.double(), bank, "occlusion", layers=layers, method="dense")
+            for method in METHODS:
+                coded = render(image.float(), defocus, single, "occlusion", layers=layers, method=method)
+                self.assert_close(coded.double(), expected, rtol=0, atol=2e-5)

@@ -2,90 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import product
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from kornia_tidy.render.backends import batched
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.layer_sums import present_in_tiles
-from kornia_tidy.render.borders import BORDERS
 from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.scene import Labels, layered_scene
 from tests.base import BaseTester
 from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
-from tests.render.scenes import Bank, make_bank, make_scene, squares
+from tests.render.scenes import HARD, Bank, hard_depth, make_bank, make_scene, squares
 from tests.simulated_device import SimulatedDevice
 
 SUMS = ("gather", "scatter")
 over_compositing = pytest.mark.parametrize("compositing", COMPOSITING)
-ATOL = {torch.float32: 2e-6, torch.float64: 1e-12}
-
-
-def depth_map(kind, bank, height, width):
-    """Scenes that are hard on tiles."""
-    like = {"dtype": bank.psfs.dtype, "device": bank.psfs.device}
-    nodes = bank.defocus
-    y, x = torch.arange(height, device=like["device"])[:, None], torch.arange(width, device=like["device"])
-    if kind == "checkerboard of all layers":
-        return nodes[(y + x) % len(nodes)][None, None]
-    if kind == "half way between layers":
-        return ((nodes[1:] + nodes[:-1]) / 2)[(y // 3 + x) % (len(nodes) - 1)][None, None]
-    flat = torch.full((1, 1, height, width), float(nodes[1]), **like)
-    if kind == "one pixel of another layer":
-        flat[..., height // 2, width // 3] = nodes[-1]
-    if kind == "a ramp":
-        flat[:] = nodes[0] + (nodes[-1] - nodes[0]) * (x / max(width - 1, 1)).to(nodes.dtype)
-    return flat
-
-
-KINDS = (
-    "checkerboard of all layers",
-    "half way between layers",
-    "constant",
-    "one pixel of another layer",
-    "a ramp",
-)
 
 
 class TestBatchedRender(RenderTester):
-    @over_compositing
-    @pytest.mark.parametrize("layers", ["nearest", "linear"])
-    @pytest.mark.parametrize("kind", KINDS)
-    def test_feature_equals_the_dense_render_of_hard_scenes(self, compositing, layers, kind, device, dtype):
-        bank = make_bank(6, 2, 5, dtype=dtype, device=device, light=0.8, veil=True)
-        image, _ = make_scene(bank, 2, 37, 51)
-        atol = ATOL[dtype] * (10 if compositing == "occlusion" else 1)
-        defocus = depth_map(kind, bank, 37, 51)
-        self.assert_equals_dense(SMALL_TILES, image, defocus, bank, compositing, atol, layers=layers)
-
-    @over_compositing
-    @given(data=st.data())
-    @settings(max_examples=40)
-    def test_property_equals_the_dense_render_at_any_size(self, compositing, data):
-        draw, occludes = data.draw, compositing == "occlusion"
-        torch.manual_seed(draw(st.integers(0, 99)))
-        radius, border = draw(st.integers(0, 9)), draw(st.sampled_from(BORDERS))
-        smallest = {"reflect": radius + 1, "circular": max(radius, 1), "valid": 2 * radius + 1}.get(border, 1)
-        height, width = (draw(st.integers(smallest, 90)) for _ in range(2))
-        count = draw(st.integers(1, 6))
-        bank = make_bank(count, draw(st.sampled_from([1, 3])), 2 * radius + 1, light=0.7, veil=True)
-        image, defocus = make_scene(bank, draw(st.integers(1, 3)), height, width)
-        kind = draw(st.sampled_from(["random", "one for all", *(KINDS if count > 1 else ())]))
-        if occludes:  # where a PSF has no light, round-off is divided by epsilon
-            bank = replace(bank, psfs=bank.psfs + 0.5 / (2 * radius + 1) ** 2)
-            defocus = squares(bank, height, width, draw(st.integers(1, 60)))
-        elif kind != "random":
-            defocus = defocus[:1] if kind == "one for all" else depth_map(kind, bank, height, width)
-        layers = draw(st.sampled_from(["nearest", "linear"]))
-        atol = 1e-11 if occludes else 1e-12
-        self.assert_equals_dense("batched", image, defocus, bank, compositing, atol, layers=layers, border=border)
-
     @over_compositing
     @pytest.mark.parametrize("border", ["zero", "replicate"])
     def test_feature_psfs_larger_than_the_image(self, compositing, border, device):
@@ -103,8 +40,6 @@ class TestBatchedRender(RenderTester):
         defocus = bank.defocus[1].expand(1, 1, 8, 40) if odd else squares(bank, 8, 40, 5)
         layers = "nearest" if odd else "linear"  # gradients reach 1 / epsilon
         self.assert_gradients_equal_dense(SMALL_TILES, image, defocus, bank, "occlusion", 1e-6, layers=layers)
-
-    # Equal to sums over pixels, which share no code with either renderer
 
     # Memory
 
@@ -162,12 +97,12 @@ class LargestTensor(TorchDispatchMode):
 
 
 class TestTiles(BaseTester):
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("kind", HARD)
     @pytest.mark.parametrize("reach", [0, 4])
     def test_feature_layers_are_those_that_tiles_or_their_windows_hold(self, kind, reach):
         """Counted pixel by pixel."""
         bank = make_bank(6, 1, 5)
-        psi = depth_map(kind, bank, 37 + reach, 51 + reach)
+        psi = hard_depth(kind, bank, 37 + reach, 51 + reach)
         label = (psi[0] - bank.defocus.view(-1, 1, 1)).abs().argmin(0)[None].expand(2, -1, -1)
         present = present_in_tiles(Labels(label, None), (12, 14), 6, reach).view(2, 4, 4, 6)
         for b, r, k in product(range(2), range(4), range(4)):

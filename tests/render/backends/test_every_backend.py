@@ -5,8 +5,12 @@ Batched rendering is tried twice: with the tiles that it chooses, and with so sm
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kornia_tidy.render import layered_scene
 from kornia_tidy.render.borders import BORDERS
@@ -14,7 +18,7 @@ from kornia_tidy.render.compositing import COMPOSITING, render
 from kornia_tidy.render.dispatch import BACKENDS, refusal
 from tests.base import BaseTester
 from tests.render.render_tester import SMALL_TILES, RenderTester, render_by
-from tests.render.scenes import Bank, make_bank, make_scene, squares
+from tests.render.scenes import HARD, Bank, hard_depth, make_bank, make_scene, squares
 
 OTHERS = {**{name: backend for name, backend in BACKENDS.items() if name != "dense"}, "small tiles": SMALL_TILES}
 # Sums of some 1e3 products of light below 1, in any order; occlusion divides them by what a layer is seen by.
@@ -33,24 +37,49 @@ over_layers = pytest.mark.parametrize("layers", ["nearest", "linear"])
 
 
 class TestEveryBackend(RenderTester):
-    @over_backends
     @over_compositing
     @over_layers
     @pytest.mark.parametrize("border", BORDERS)
-    def test_feature_equals_the_dense_render(self, backend, compositing, layers, border, device, dtype):
+    def test_feature_equals_the_dense_render(self, compositing, layers, border, device, dtype):
         """Where depth is noise, and in squares that leave tiles of one layer."""
-        seen = 0
         for batch, maps, channels, size, height, width in SHAPES:
             bank = make_bank(5, channels, size, dtype=dtype, device=device, light=0.8, veil=True)
             image, defocus = make_scene(bank, batch, height, width)
             options = {"layers": layers, "border": border, "correlate": height == 31}
-            why = self.refused(backend, image, defocus, bank, compositing, **options)
-            if why is None:
-                atol, seen = ROUNDING[dtype, compositing == "occlusion"], seen + 1
-                for psi in (defocus[:maps], squares(bank, height, width, 15)):
-                    self.assert_equals_dense(backend, image, psi, bank, compositing, atol, **options)
-        if not seen:
-            pytest.skip(f"it supports none of these scenes here: {why}")
+            for psi in (defocus[:maps], squares(bank, height, width, 15)):
+                atol = ROUNDING[dtype, compositing == "occlusion"]
+                self.assert_all_equal_dense(image, psi, bank, compositing, atol, **options)
+
+    @over_compositing
+    @over_layers
+    @pytest.mark.parametrize("kind", HARD)
+    def test_feature_equals_the_dense_render_of_hard_scenes(self, compositing, layers, kind, device, dtype):
+        """By direct sums and by windows."""
+        atol = {torch.float32: 2e-6, torch.float64: 1e-12}[dtype] * (10 if compositing == "occlusion" else 1)
+        for size, border in ((5, "reflect"), (11, "zero")):
+            bank = make_bank(6, 2, size, dtype=dtype, device=device, light=0.8, veil=True)
+            image, defocus = make_scene(bank, 2, 45, 83)[0], hard_depth(kind, bank, 45, 83)
+            self.assert_all_equal_dense(image, defocus, bank, compositing, atol, layers=layers, border=border)
+
+    @over_compositing
+    @given(data=st.data())
+    @settings(max_examples=30)
+    def test_property_equals_the_dense_render_at_any_size(self, compositing, data):
+        draw, occludes = data.draw, compositing == "occlusion"
+        torch.manual_seed(draw(st.integers(0, 99)))
+        radius, border = draw(st.integers(0, 9)), draw(st.sampled_from(BORDERS))
+        smallest = {"reflect": radius + 1, "circular": max(radius, 1), "valid": 2 * radius + 1}.get(border, 1)
+        height, width = (draw(st.integers(smallest, 90)) for _ in range(2))
+        bank = make_bank(draw(st.integers(1, 6)), draw(st.sampled_from([1, 3])), 2 * radius + 1, light=0.7, veil=True)
+        image, defocus = make_scene(bank, draw(st.integers(1, 3)), height, width)
+        kind = draw(st.sampled_from(["random", "one for all", *HARD]))
+        if occludes:  # where a PSF has no light, round-off is divided by epsilon
+            bank = replace(bank, psfs=bank.psfs + 0.5 / (2 * radius + 1) ** 2)
+            defocus = squares(bank, height, width, draw(st.integers(1, 60)))
+        elif kind != "random":
+            defocus = defocus[:1] if kind == "one for all" else hard_depth(kind, bank, height, width)
+        options = {"layers": draw(st.sampled_from(["nearest", "linear"])), "border": border}
+        self.assert_all_equal_dense(image, defocus, bank, compositing, 1e-11 if occludes else 1e-12, **options)
 
     @over_backends
     @over_compositing
@@ -112,6 +141,14 @@ class TestEveryBackend(RenderTester):
         expected = render_by(backend, image, defocus, bank, compositing)
         bank.psfs[[0, 3, 4, 5]] = float("nan")
         assert torch.equal(render_by(backend, image, defocus, bank, compositing), expected)
+
+    def assert_all_equal_dense(self, image, defocus, bank, compositing, atol, **options) -> None:
+        """Compare every backend that supports a scene with the dense one."""
+        expected = render(image, defocus, bank, compositing, method="dense", **options)
+        for backend in OTHERS.values():
+            if self.refused(backend, image, defocus, bank, compositing, **options) is None:
+                found = render_by(backend, image, defocus, bank, compositing, **options)
+                self.assert_close(found, expected, rtol=0, atol=atol)
 
     @staticmethod
     def refused(backend, image, defocus, bank, compositing, **options) -> str | None:
