@@ -9,15 +9,15 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_float_tensor
+from kornia_tidy.checks import check_choice, check_float_tensor, check_not_negative
 from kornia_tidy.choices import INVERSES
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
 from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.predicted_error import best_wiener_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
-from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
 
 WEIGHTS = tuple(3e-3 * 10 ** (i / 2) for i in range(4))  # 0.003 to 0.095
 # The best weight is 0.003 (noise / 0.002) ** 1.3. If a bilateral filter follows, which takes noise away, it is
@@ -93,8 +93,8 @@ class ClosedForm(nn.Module):
     without the filter the weight rises with an exponent of 1.3. Estimates of four fixed weights from 0.003 to 0.095 are
     interpolated linearly in :math:`\log \gamma`, in linear light. The bilateral filter works on the encoded image.
 
-    Wiener's filter (:func:`~kornia_tidy.reconstruction.wiener_kernels.wiener_kernels`) knows the power spectrum of
-    scenes and how PSFs differ between depths. It takes the noise for
+    Wiener's filter (:func:`~kornia_tidy.reconstruction.predicted_error.best_wiener_kernels`) knows the power spectrum
+    of scenes and how PSFs differ between depths. It takes the noise for
 
     .. math:: \sigma'^2 = 0.5 \, \sigma^2 \max(\sigma / 0.002, 1)^{0.3},
 
@@ -226,7 +226,7 @@ class ClosedForm(nn.Module):
 
     def _kernels_of(self, psfs: Tensor) -> Tensor:
         if self.inverse == "wiener":
-            return wiener_kernels(psfs, WIENER_NOISES)
+            return best_wiener_kernels(psfs, WIENER_NOISES)
         return tikhonov_kernels(psfs.mean(0), WEIGHTS)
 
     def set_noise(self, sensor: nn.Module) -> None:
@@ -249,10 +249,12 @@ class ClosedForm(nn.Module):
         """Return the standard deviation of the noise in each pixel, (B, 3, H, W), in units of full scale.
 
         Raises:
-            ValueError: if the noise does not broadcast to the capture.
+            ValueError: if the noise does not broadcast to the capture, or is a negative or no finite number.
         """
         if noise is None:
             return self._noise_of(self._light(capture.clamp(0, 1)))
+        if isinstance(noise, float | int):
+            check_not_negative("noise", noise, "in units of full scale")
         noise = noise.to(capture) if isinstance(noise, Tensor) else capture.new_tensor(noise)
         fits = all(side in {1, whole} for side, whole in zip(noise.shape, capture.shape, strict=False))
         if noise.ndim not in {0, 4} or not fits:
@@ -273,6 +275,8 @@ class ClosedForm(nn.Module):
         if not self.kernels.numel():
             raise ValueError("the closed form does not know its camera: call set_psfs(optics.psf_bank()) first")
         check_float_tensor("capture", capture, 4, "(B, 3, H, W)")
+        if capture.shape[1] != 3 or 0 in capture.shape[-2:]:
+            raise ValueError(f"capture must have shape (B, 3, H, W) with one pixel or more, got {tuple(capture.shape)}")
 
     def blend(self, layers: Tensor, shares: Tensor, noise: Tensor) -> Tensor:
         """Return the light deconvolved for each depth, averaged pixel by pixel with the shares of depths, and smoothed.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -24,11 +23,11 @@ from kornia_tidy.reconstruction.closed_form import (
     interpolated,
 )
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
-from kornia_tidy.reconstruction.tikhonov import transfer_function
+from kornia_tidy.reconstruction.predicted_error import depth_shares, predicted_errors
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels
 from kornia_tidy.reconstruction.wiener import inverse_spectrum, transfer_moments
 from kornia_tidy.reconstruction.wiener_kernels import wiener_kernels
-from kornia_tidy.render.borders import next_fast_size, pad_border
+from kornia_tidy.render.borders import pad_border
 
 BANDS = (1 / 16, 1 / 8, 1 / 4)  # cycles a pixel, between four bands of spatial frequency
 PLANE = 64  # samples along a side of the transfer function, for averages over bands
@@ -328,38 +327,6 @@ def light_detail(light: Tensor) -> Tensor:
     return (along + down).nan_to_num() / 2
 
 
-def predicted_errors(psfs: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return the mean squared error of photographs without noise by each kernel, and their detail behind the camera.
-
-    .. math:: \int S \, \big\langle |1 - K H|^2 \big\rangle \, df, \qquad
-              \int S \, \langle |H|^2 \rangle (2 - \cos 2 \pi f_x - \cos 2 \pi f_y) \, df
-
-    Args:
-        psfs: (D, C, P, P) with P odd, at depths of evenly spaced defocus, from the farthest to the nearest.
-        kernels: (N, C, Q, Q) with Q odd.
-
-    Returns:
-        (N,) in linear light, mean over the colours; and :func:`light_detail` of captures without noise, a scalar.
-
-    Example:
-        >>> point = torch.zeros(2, 1, 3, 3)
-        >>> point[..., 1, 1] = 1.0
-        >>> errors, _ = predicted_errors(point, torch.cat([point[:1], 0.5 * point[:1]]))
-        >>> bool(errors[0].abs() < 1e-6), bool(errors[1] > 10 * errors[0].abs())
-        (True, True)
-    """
-    side = next_fast_size(psfs.shape[-1] + kernels.shape[-1])
-    size = (side, side)
-    moments = transfer_moments(psfs, size, _shares(psfs))
-    inverse = transfer_function(kernels, size)
-    power = _scene_power(side).to(psfs)
-    squared = inverse.real.square() + inverse.imag.square()
-    left = 1 - 2 * (inverse * moments.mean).real + squared * moments.power
-    down, across = torch.fft.fftfreq(side)[:, None], torch.fft.rfftfreq(side)
-    differences = (2 - (2 * math.pi * down).cos() - (2 * math.pi * across).cos()).to(psfs)
-    return (left * power).sum((-2, -1)).mean(1), (moments.power.mean(0) * differences * power).sum()
-
-
 def band_facts(psfs: Tensor) -> Tensor:
     r"""Return the share of a scene's power that is not restored, and the transfer, in bands of frequency.
 
@@ -383,7 +350,7 @@ def band_facts(psfs: Tensor) -> Tensor:
         (True, True)
     """
     size = (PLANE, PLANE)
-    moments = transfer_moments(psfs, size, _shares(psfs))
+    moments = transfer_moments(psfs, size, depth_shares(psfs))
     squared = moments.mean.real.square() + moments.mean.imag.square()
     to_scene = inverse_spectrum(PHOTOGRAPHS, size).to(psfs)
     frequency = torch.hypot(
@@ -398,19 +365,6 @@ def band_facts(psfs: Tensor) -> Tensor:
     errors = (lost[:, None] * power).sum((-2, -1)) / power.sum((-2, -1))
     transfer = (squared.sqrt().mean(0) * members).sum((-2, -1)) / members.sum((-2, -1))
     return torch.stack([errors, transfer.expand_as(errors)])
-
-
-def _shares(psfs: Tensor) -> Tensor:
-    """Return the share of pixels of photographs at each depth."""
-    return PHOTOGRAPHS.depth_weights(torch.linspace(-1.0, 1.0, len(psfs), dtype=torch.float64)).to(psfs)
-
-
-@lru_cache(maxsize=4)
-def _scene_power(side: int) -> Tensor:
-    """Return the power of photographs on a half spectrum, but that of white, which is restored; it is not changed."""
-    power = PHOTOGRAPHS.cell_power(side)
-    power[0, 0] = 0
-    return power
 
 
 def _risk(first: Tensor, second: Tensor, noise: Tensor, color: Tensor) -> Tensor:

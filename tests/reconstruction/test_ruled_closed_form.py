@@ -14,6 +14,7 @@ from kornia_tidy.reconstruction import ClosedFormHead, RuledClosedForm, reconstr
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.closed_form import NODES, WIENER_NOISES
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.predicted_error import predicted_errors
 from kornia_tidy.reconstruction.ruled_closed_form import (
     BEFORE_BILATERAL,
     CAMERA_MAPS,
@@ -23,7 +24,6 @@ from kornia_tidy.reconstruction.ruled_closed_form import (
     STEPS,
     band_facts,
     light_detail,
-    predicted_errors,
 )
 from tests.base import BaseTester
 from tests.reconstruction.test_closed_form import bank, photo
