@@ -52,7 +52,7 @@ def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) ->
         return TiDyOptics(masks, fidelity=fidelity, compositing=compositing, lens=lens, field_center=field_center)
 
     ideal, real = camera(None), camera(LENS)
-    psi = ideal.defocus(depth)
+    psi = ideal.camera.defocus(depth)
     field = real.psf_model.field_of(size, field_center)
     assert isinstance(field, Field)
     with torch.no_grad():

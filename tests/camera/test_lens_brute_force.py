@@ -89,7 +89,7 @@ class TestBruteForce(BaseTester):
             worst = torch.zeros(3)
             for seed in range(SCENES):
                 image, depth = scene(seed)
-                psi = usual.defocus(depth).double().clamp(nodes[0], nodes[-1])
+                psi = usual.camera.defocus(depth).double().clamp(nodes[0], nodes[-1])
                 given = compositing, image.double(), psi, nodes
                 exact, axis = brute_force(*given, psfs, lit), brute_force(*given, ideal, torch.ones_like(lit))
                 seen = usual(image, depth)[0, 0], fine(image, depth)[0, 0], axis
