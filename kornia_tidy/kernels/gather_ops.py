@@ -27,6 +27,7 @@ def gather_direct(
     layer_index: Tensor,
     layer_weight: Tensor | None = None,
     *,
+    correlate: bool = False,
     weight_gradient: bool = False,
 ) -> Tensor:
     r"""Convolve a plane with the PSFs of each pixel's layers and blend them: operator ``kornia_tidy::gather_direct``.
@@ -39,6 +40,7 @@ def gather_direct(
             in the P + 16 rows around a pixel, as sums of columns have it.
         layer_index: d, (B, H, W) int64.
         layer_weight: t, share of the next layer in [0, 1], (B, H, W) of the plane's dtype, or None for zero.
+        correlate: with PSFs that are flipped by 180 degrees.
         weight_gradient: return :math:`\partial I_c / \partial t` instead.
 
     Returns:
@@ -50,7 +52,8 @@ def gather_direct(
         IndexError: if a pixel lies in no layer.
         NotBuiltError: if the source cannot be compiled.
     """
-    return torch.ops.kornia_tidy.gather_direct(plane, psfs, layer_index, layer_weight, weight_gradient)
+    turned = psfs.flip((-2, -1)) if correlate else psfs
+    return torch.ops.kornia_tidy.gather_direct(plane, turned, layer_index, layer_weight, weight_gradient)
 
 
 def count_terms(psfs: Tensor) -> int:

@@ -10,6 +10,7 @@ import torch
 
 from kornia_tidy.augmentation.depth_blur import disc
 from kornia_tidy.kernels.gather_ops import SOURCE, count_terms, gather_direct
+from kornia_tidy.kernels.overlap_ops import gather_overlap, window_size
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import LayeredSceneTester, needs_compiler
 
@@ -45,6 +46,12 @@ class TestGatherDirect(LayeredSceneTester):
         index = given["layer_index"][:1].expand(2, -1, -1)
         expected = gather_direct(plane.clone().contiguous(), given["psfs"], index.contiguous())
         assert torch.equal(gather_direct(plane, given["psfs"], index), expected)
+
+    @needs_compiler
+    def test_feature_flipped_psfs_as_by_windows(self):
+        given = scene()
+        expected = gather_overlap(**given, size=window_size(3), correlate=True)
+        self.assert_close(gather_direct(**given, correlate=True), expected)
 
     @needs_compiler
     @pytest.mark.parametrize("radius", [0.0, 0.7, 2.0, 5.0, 11.0, 16.0])

@@ -9,7 +9,8 @@ depth by :mod:`~kornia_tidy.render.backends.batched`. See :mod:`kornia_tidy.kern
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
-from kornia_tidy.render.backends.layer_sums import blend_gradients, present_in_tiles, seen
+from kornia_tidy.render.backends.layer_sums import LayerSums, blend_gradients, present_in_tiles, seen
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 # With this limit and windows of 2.5 P (`window_size`) gather and scatter took 1.04 times the time of the best choice
@@ -84,7 +85,7 @@ class CompiledBackend:
         keep_memory()
         if scene.compositing == "occlusion":
             return _occlusion_gradients(scene, gradient)
-        return blend_gradients(scene, _Sums(scene), gradient)
+        return blend_gradients(scene, cast("LayerSums", _Sums(scene)), gradient)
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work: of occlusion as the C code counts it, of windows with the layers in a sample of pixels."""
@@ -128,33 +129,29 @@ class _Sums:
     """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`."""
 
     def __init__(self, scene: LayeredScene) -> None:
-        self.psfs, self.labels = scene.psfs.detach(), (scene.labels.layer_index, scene.labels.layer_weight)
-        self.size, self.places, self.terms = window_size(scene.psfs.shape[-1]), (), 0
+        psfs, self.index, self.weight = scene.psfs.detach(), scene.labels.layer_index, scene.labels.layer_weight
+        self.size, self.places, self.terms = window_size(psfs.shape[-1]), (), 0
         if scene.field is not None:
-            self.psfs, self.places = self.psfs.unflatten(0, scene.field.nodes), scene.places
+            psfs, self.places = psfs.unflatten(0, scene.field.nodes), scene.places
         elif scene.compositing == "gather":
-            count, side, terms = self.psfs.shape[0] * self.psfs.shape[1], self.psfs.shape[-1], 0
+            count, side, terms = psfs.shape[0] * psfs.shape[1], psfs.shape[-1], 0
             if side <= LARGEST_DIRECT:
                 terms = side**2
             # Most pairs of neighbours in the middle of a disc are equal, and none in that of other PSFs. Where only
             # work is counted, PSFs are one expanded number.
-            elif self.psfs.stride(-1) and 2 * int(self.psfs[..., side // 2].diff().count_nonzero()) <= count * side:
-                terms = -(-count_terms(self.psfs) // count)
+            elif psfs.stride(-1) and 2 * int(psfs[..., side // 2].diff().count_nonzero()) <= count * side:
+                terms = -(-count_terms(psfs) // count)
             if terms and (side <= LARGEST_DIRECT or 2 * terms <= side**2):
                 self.terms = terms * _fits(scene, gather_ops.smallest_output(scene.image.dtype))
-
-    def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
-        if self.terms:
-            return gather_direct(plane, self.psfs, *self.labels, weight_gradient=weight_gradient)
-        options = {"correlate": correlate, "weight_gradient": weight_gradient, "places": self.places}
-        return gather_overlap(plane, self.psfs, *self.labels, self.size, **options)
-
-    def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        return scatter_overlap(pixels, self.psfs, *self.labels, self.size, correlate=correlate, places=self.places)
+        given: dict[str, Any] = {"psfs": psfs, "layer_index": self.index, "layer_weight": self.weight}
+        windows = {**given, "size": self.size, "places": self.places}
+        self.layers = psfs.shape[-4]
+        self.gather = partial(gather_direct, **given) if self.terms else partial(gather_overlap, **windows)
+        self.scatter = partial(scatter_overlap, **windows)
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
-        given = plane, pixels, *self.labels, self.psfs.shape[-4]
-        found = overlap_psf_gradient(*given, self.size, correlate=correlate, places=self.places)
+        given = plane, pixels, self.index, self.weight, self.layers, self.size
+        found = overlap_psf_gradient(*given, correlate=correlate, places=self.places)
         return found.flatten(0, 1) if self.places else found
 
 
