@@ -52,7 +52,7 @@ class TestAdversarialScenes(BaseTester):
         outcome = judge(Case(kind, seed, compositing, border, "flat", size, tolerance))
         assert outcome.measured <= tolerance, outcome
 
-    @pytest.mark.parametrize("seed", [1091, 1133, 1679])
+    @pytest.mark.parametrize("seed", [pytest.param(1091, marks=pytest.mark.takes_seconds), 1133, 1679])
     def test_feature_tiny_images_on_black_are_renormalised_to_what_they_see(self, seed):
         """Occlusion divides by the share of a PSF within the image, and errors with it: off 1.3 times before."""
         case = Case.of_seed(seed)

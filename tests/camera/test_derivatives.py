@@ -211,6 +211,7 @@ class TestTransformsOfTorch(BaseTester):
             one, other = vmap(lambda i: optics(i, depth), randomness="different")(torch.stack([image, image]))
         assert not torch.equal(one, other)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.filterwarnings("ignore:Attempted to insert a get_attr Node:UserWarning")  # masks are its constants
     def test_feature_linearize_is_the_derivative(self, compositing):
         optics, (image, depth) = camera(compositing), scene()

@@ -12,7 +12,7 @@ from kornia_tidy import TiDyOptics
 from tests.base import BaseTester
 from tests.camera.pipeline_samples import Scenes, camera, scene
 
-LOADERS = [(0, None), (2, "fork"), (2, "spawn")]
+LOADERS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.takes_seconds)]
 
 # Python 3.12 and later: every process that uses torch has threads, and fork says so.
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")

@@ -11,8 +11,6 @@ from kornia_tidy.reconstruction import (
     NAFNet,
     PhaseCam3DUNet,
     closed_form_channels,
-    receptive_field,
-    reconstruct_tiled,
 )
 from kornia_tidy.reconstruction.closed_form_head import with_fine_maps
 from kornia_tidy.reconstruction.heads import PlainHead
@@ -35,12 +33,6 @@ def head_of(network, layers=0, dtype=torch.float32, *, trained=False, **options)
 def small(maps=3, layers=0):
     torch.manual_seed(0)
     return NAFNet(closed_form_channels(layers), maps, width=2)
-
-
-def tiled_and_whole(head):
-    image = photo(40, 330, dtype=torch.float32)[:1]
-    with torch.no_grad():
-        return reconstruct_tiled(head, image, tile=(48, 288)), head(image)
 
 
 class TestClosedFormHead(BaseTester):
@@ -74,12 +66,6 @@ class TestClosedFormHead(BaseTester):
             assert not torch.equal(fine(capture, 0.01), plain(capture, 0.01))
         with pytest.raises(ValueError, match="without fine maps must take 23 maps to be given them, got 27"):
             with_fine_maps(fine.state_dict(), fine)
-
-    def test_feature_tiles_are_the_whole(self):
-        """Kernels, the filter and the network see no farther than the margin."""
-        head = head_of(small(), trained=True)
-        assert receptive_field(head_of(None)) == 5 // 2 + 8 + 3
-        self.assert_close(*tiled_and_whole(head), atol=1e-4, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx_takes_capture_and_noise(self):

@@ -13,10 +13,7 @@ from kornia_tidy.reconstruction import (
     JointClosedFormHead,
     JointHead,
     NAFNet,
-    UncertainJointEstimate,
     closed_form_channels,
-    receptive_field,
-    reconstruct_tiled,
 )
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.closed_form import (
@@ -164,19 +161,6 @@ class TestJointClosedFormHead(BaseTester):
         assert torch.equal(in_training[:, CLASSES:], before[:, CLASSES:])
         self.assert_close(smoothed_classes(*in_training.split([CLASSES, 3], 1)), before[:, :CLASSES])
         assert "temperature" in head.state_dict()
-
-    @pytest.mark.takes_seconds
-    @pytest.mark.parametrize(("kind", "refined"), [(NAFNet, False), (PlainHead, False), (PlainHead, True)])
-    def test_feature_tiles_are_the_whole(self, kind, refined):
-        """Classes are averaged on a grid of 4 pixels, also behind a network without a grid of its own."""
-        head = JointHead(joint(trained=True, dtype=torch.float64, kind=kind, refined=refined)).eval()
-        margin = receptive_field(head)
-        image = photo(40, 2 * margin + 80)[:1]
-        with torch.no_grad():
-            whole, tiled = head(image), reconstruct_tiled(head, image, tile=(48, 2 * margin + 32))
-        assert isinstance(tiled, UncertainJointEstimate)
-        for part, expected in zip(tiled, whole, strict=True):
-            self.assert_close(part, expected, atol=1e-9, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx(self):

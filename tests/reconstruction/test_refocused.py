@@ -10,7 +10,7 @@ import torch
 from scipy.signal import convolve2d
 
 from kornia_tidy import PSFBank
-from kornia_tidy.reconstruction import AttentionUNet, ReconstructionHead, Refocused, receptive_field, reconstruct_tiled
+from kornia_tidy.reconstruction import AttentionUNet, ReconstructionHead, Refocused
 from kornia_tidy.reconstruction.refocused import inverse_filters
 from kornia_tidy.reconstruction.tikhonov import tikhonov_layers
 from tests.base import BaseTester
@@ -73,16 +73,6 @@ class TestRefocused(BaseTester):
         padded = np.pad(image[0].mean(0).numpy(), 4, "reflect" if min(size) > 4 else "edge")
         for filtered, psf in zip(shown[0, 3:], inverse_filters(discs(dtype=torch.float64)), strict=True):
             self.assert_close(filtered, torch.from_numpy(convolve2d(padded, psf.numpy(), "valid")))
-
-    def test_feature_tiles_are_the_whole(self):
-        """Filters see as far as PSFs reach and no farther, though they are applied by a transform of all."""
-        torch.manual_seed(0)
-        assert receptive_field(refocused(Shown(7, 7))) == 4
-        head = refocused(AttentionUNet(7, 2, width=2))
-        image = torch.rand(1, 3, 200, 330)
-        with torch.no_grad():
-            whole, tiled = head(image), reconstruct_tiled(head, image, memory_budget=24 << 20)
-        self.assert_close(tiled, whole, atol=1e-5, rtol=0)
 
     @pytest.mark.slow
     def test_feature_onnx(self):

@@ -29,6 +29,11 @@ from kornia_tidy.reconstruction.receptive_field import maps_of
 from kornia_tidy.reconstruction.tile_grid import TileGrid
 from kornia_tidy.reconstruction.tiled import SEAM, shared_copy
 from tests.base import BaseTester
+from tests.reconstruction.test_closed_form import photo
+from tests.reconstruction.test_closed_form_head import head_of, small
+from tests.reconstruction.test_joint_closed_form import joint
+from tests.reconstruction.test_layered_joint import stirred
+from tests.reconstruction.test_refocused import Shown, refocused
 
 
 class SmallUNet(ReconstructionHead):
@@ -134,6 +139,33 @@ class TestSeams(BaseTester):
         image = torch.rand(1, 3, 40, 50)
         assert seam(head, image, tile=20, overlap=3)[0] < 1e-6
         assert seam(head, image, tile=20, overlap=2)[0] > 1e-3
+
+    @pytest.mark.parametrize(
+        ("make", "margin"),
+        [
+            (lambda: head_of(small(), dtype=torch.float64, trained=True), None),
+            (lambda: head_of(None, dtype=torch.float64), 5 // 2 + 8 + 3),
+            (lambda: JointHead(stirred(width=2, dtype=torch.float64)), 10 + 8 + 31 + 31),  # filters, patches, networks
+            (lambda: refocused(AttentionUNet(7, 2, width=2).double(), torch.float64), None),
+            (lambda: refocused(Shown(7, 7), torch.float64), 4),  # though they are applied by a transform of all
+            pytest.param(lambda: joint_estimate(kind=NAFNet), None, marks=pytest.mark.takes_seconds),
+            pytest.param(lambda: joint_estimate(kind=PlainHead), None, marks=pytest.mark.takes_seconds),
+            pytest.param(lambda: joint_estimate(kind=PlainHead, refined=True), None, marks=pytest.mark.takes_seconds),
+        ],
+    )
+    def test_feature_kernels_filters_and_networks_see_no_farther_than_the_margin(self, make, margin):
+        """Classes of depth are averaged on a grid of 4 pixels, also behind a network without a grid of its own."""
+        torch.manual_seed(0)
+        head = make().eval()
+        reach = receptive_field(head)
+        assert margin in (None, reach)
+        difference, tiles, _ = seam(head, photo(40, 2 * reach + 80)[:1], tile=(48, 2 * reach + 32))
+        assert tiles > 1
+        assert difference <= 1e-9
+
+
+def joint_estimate(**options):
+    return JointHead(joint(trained=True, dtype=torch.float64, **options))
 
 
 class TestReconstructTiled(BaseTester):

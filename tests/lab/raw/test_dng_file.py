@@ -49,8 +49,7 @@ class TestDng(BaseTester):
         planes = seen[None] if seen.ndim == 2 else seen[..., :3].transpose(2, 0, 1)
         assert np.array_equal(planes, raw.counts.numpy())
 
-    @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GBRG", "GRBG"])
-    @pytest.mark.parametrize("bits", [12, 14, 16])
+    @pytest.mark.parametrize(("pattern", "bits"), [("RGGB", 12), ("BGGR", 14), ("GBRG", 16), ("GRBG", 12)])
     def test_feature_opens_as_the_same_capture(self, tmp_path, pattern, bits):
         info = RawInfo("Acme", "One", "Prime 50", 800.0, 1 / 125, 2.8, 0.05, datetime(2024, 1, 2, 3, 4, 5))
         balance = torch.tensor([2.0, 1.0, 1.6, 1.0])

@@ -127,6 +127,7 @@ def tail(successes, trials, chance):
 
 
 class TestCoverage(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_the_uncertainty_covers_the_error_in_a_few_calibrations(self, lights):
         """So few covered values would come in one of 10,000 runs, were 95 % of all covered."""
         outcomes = [calibration(lights, kind, 1000 + n) for n, kind in enumerate(KINDS * 3)]
