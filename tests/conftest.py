@@ -42,6 +42,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
                     item.add_marker(pytest.mark.skip(reason=f"{mark}: run with --runslow"))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _seed_of_module() -> None:
+    """Fixtures of a module draw the same whatever ran before."""
+    torch.manual_seed(0)
+
+
 @pytest.fixture(autouse=True)
 def _seed(request: pytest.FixtureRequest) -> None:
     torch.manual_seed(0)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import struct
-import time
 
 import numpy as np
 import pytest
@@ -36,6 +35,7 @@ class TestCameraTags(BaseTester):
         assert found["model"] == "a[2J b"
         assert found["timestamp"] == "2024-02-29T12:34:56"
 
+    @pytest.mark.timeout(60)
     def test_feature_directories_that_name_each_other_are_read_once(self):
         """A ring of two, and one with as many directories below it as there can be."""
         entry = struct.pack("<HHII", 0x014A, LONG, 1, 8)
@@ -44,9 +44,7 @@ class TestCameraTags(BaseTester):
         below = struct.pack("<HHII", 0x014A, LONG, 16000, 26)
         wide = b"II*\0" + struct.pack("<I", 8) + struct.pack("<H", 1) + below + struct.pack("<I", 0)
         wide += struct.pack("<16000I", *range(26, 16026)) + bytes(range(256)) * 100
-        start = time.perf_counter()
         assert len(list(tiff_directories(wide))) == 32
-        assert time.perf_counter() - start < 5
 
     @pytest.mark.timeout(60)
     def test_feature_directories_that_name_thousands_end_in_time(self):
