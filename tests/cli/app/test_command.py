@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from kornia_tidy.cli import main
 from tests.base import BaseTester
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -14,15 +13,13 @@ ROOT = Path(__file__).resolve().parents[3]
 
 class TestCommand(BaseTester):
     @pytest.mark.parametrize("text", ["0", "80", "65536", "x", "-1", "8080.5", "9" * 400])
-    def test_exception_ports(self, text, capsys):
-        assert main(["app", f"--port={text}"]) == 2
-        assert "--port must be a whole number from 1024 to 65535, got" in capsys.readouterr().err
+    def test_exception_ports(self, text, refused):
+        assert "--port must be a whole number from 1024 to 65535, got" in refused(["app", f"--port={text}"])
 
     @pytest.mark.skipif(importlib.util.find_spec("gradio") is not None, reason="Gradio is installed")
-    def test_exception_without_gradio_the_remedy_is_told(self, capsys):
+    def test_exception_without_gradio_the_remedy_is_told(self, refused):
         pytest.importorskip("matplotlib")
-        assert main(["app"]) == 2
-        assert "the app needs gradio: pip install 'kornia-tidy[app]'" in capsys.readouterr().err
+        assert "the app needs gradio: pip install 'kornia-tidy[app]'" in refused(["app"])
 
 
 class TestConstraints(BaseTester):

@@ -108,12 +108,9 @@ class TestRawReconstruct(BaseTester):
             (["shot.dng", "--head", "plain.safetensors", *PSFS], "--psfs is for a network that deconvolves"),
         ],
     )  # fmt: skip
-    def test_exception_is_one_sentence(self, here, arguments, sentence, capsys):
+    def test_exception_is_one_sentence(self, here, arguments, sentence, refused):
         checkpoint(here / "plain.safetensors", task="edof", **LENS)
-        assert main(["raw", "reconstruct", *arguments, "-o", "out"]) == 2
-        told = capsys.readouterr().err
-        assert sentence in told
-        assert "Traceback" not in told
+        assert sentence in refused(["raw", "reconstruct", *arguments, "-o", "out"])
         assert not list(here.glob("out/*.png"))
 
 
@@ -162,12 +159,10 @@ class TestCaptures(BaseTester):
             (["evaluate", "wiener"], "needs the PSFs of a camera: give --psfs"),
         ],
     )  # fmt: skip
-    def test_exception_is_one_sentence_and_nothing_is_written(self, here, arguments, sentence, capsys):
+    def test_exception_is_one_sentence_and_nothing_is_written(self, here, arguments, sentence, refused):
         measured_psfs(1).save(here / "grey.safetensors")
         before = set(here.iterdir())
-        assert main(arguments) == 2
-        told = capsys.readouterr().err.strip().splitlines()
-        assert sentence in told[-1]
+        assert sentence in refused(arguments)
         assert set(here.iterdir()) == before
 
 
@@ -186,7 +181,7 @@ class TestSystems(BaseTester):
 
     @pytest.mark.takes_seconds
     @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*does not have many workers")  # Lightning
-    def test_feature_a_network_learns_behind_them_and_its_checkpoint_needs_no_file(self, here, capsys):
+    def test_feature_a_network_learns_behind_them_and_its_checkpoint_needs_no_file(self, here, refused):
         pytest.importorskip("lightning.pytorch")
         small = ["--head", "plain", "--width", "4", "--size", "40", "--scenes", "4", "--validation-scenes", "1"]
         small += ["--batch", "2", "--epochs", "1", "--closed-form"]
@@ -194,9 +189,9 @@ class TestSystems(BaseTester):
         other = measured_psfs()
         replace(other, bank=replace(other.bank, psfs=other.bank.psfs.flip(-1))).save("other.safetensors")
         (here / "bank.safetensors").unlink()
-        assert main(["train", "--resume", "--psfs", "other.safetensors", "--epochs", "2", "-o", "run"]) == 2
-        assert "its PSFs are not those that are given" in capsys.readouterr().err
-        assert main(["train", "--resume", "--epochs", "2", "-o", "run"]) == 0
+        resume = ["train", "--resume", "--epochs", "2", "-o", "run"]
+        assert "its PSFs are not those that are given" in refused([*resume, "--psfs", "other.safetensors"])
+        assert main(resume) == 0
         system = load_trained("run/best.safetensors")
         assert torch.equal(system.optics.psf_bank().psfs, measured_psfs().bank.psfs)
         assert system.optics.sensor.extra_repr() == measured_noise().sensor_noise().extra_repr()

@@ -157,11 +157,10 @@ def required(words, but):
 
 class TestMistakes(BaseTester):
     @pytest.mark.parametrize("command", ["demo", "systems", "trade"])
-    def test_exception_without_matplotlib_comes_before_any_work(self, command, tmp_path, monkeypatch, capsys):
+    def test_exception_without_matplotlib_comes_before_any_work(self, command, tmp_path, monkeypatch, refused):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-        assert main([command]) == 2
-        assert "pip install 'kornia-tidy[plot]'" in capsys.readouterr().err
+        assert "pip install 'kornia-tidy[plot]'" in refused([command])
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.parametrize(
@@ -186,6 +185,5 @@ class TestMistakes(BaseTester):
             ),
         ],
     )
-    def test_exception_one_sentence_says_what_was_meant(self, argv, sentence, capsys):
-        assert main(argv) == 2
-        assert capsys.readouterr().err == f"kornia-tidy: error: {sentence}\n"
+    def test_exception_one_sentence_says_what_was_meant(self, argv, sentence, refused):
+        assert refused(argv) == f"kornia-tidy: error: {sentence}"
