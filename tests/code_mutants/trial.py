@@ -165,9 +165,11 @@ def _child(tests: Sequence[str], first: int, root: Path, log: Path) -> NoReturn:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
+        enter(root)
+        sys.dont_write_bytecode = True
         for part in (tests[:first], tests[first:]):
             if part:
-                code = run_tests(root, part)
+                code = run_tests(part)
             if code:
                 break
         sys.stdout.flush()
@@ -175,10 +177,8 @@ def _child(tests: Sequence[str], first: int, root: Path, log: Path) -> NoReturn:
         os._exit(code)
 
 
-def run_tests(root: Path, tests: Sequence[str]) -> int:
-    """Run tests of a checkout in this order, to the first that fails; return pytest's exit status."""
-    enter(root)
-    sys.dont_write_bytecode = True
+def run_tests(tests: Sequence[str]) -> int:
+    """Run tests in this order, to the first that fails; return pytest's exit status."""
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
     return int(pytest.main([*OPTIONS, "-x", "-rfE", f"--timeout={ONE_TEST}", *files], plugins=[_Chosen(tests)]))
 
