@@ -112,6 +112,13 @@ class TestRender(BaseTester):
             self.assert_close(together[b : b + 1], alone, rtol=0, atol=1e-13 if dtype == torch.float64 else 1e-6)
 
     @over_compositing
+    def test_feature_gradients_of_psfs_without_images_are_zero(self, compositing, device, dtype):
+        bank = make_bank(dtype=dtype, device=device)
+        (image, defocus), psfs = make_scene(bank), bank.psfs.requires_grad_()
+        COMPOSITING[compositing](image[:0], defocus[:0], bank.defocus, psfs, None).sum().backward()
+        assert torch.equal(psfs.grad, torch.zeros_like(psfs))
+
+    @over_compositing
     def test_feature_any_memory_layout(self, compositing, device, dtype):
         bank = make_bank(dtype=dtype, device=device)
         image, defocus = make_scene(bank)
