@@ -122,8 +122,8 @@ def half_contrast(contrast: Tensor) -> str:
     """Return the frequency at which contrast first falls to one half, in cycles per pixel, in words.
 
     Example:
-        >>> half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1]))
-        '0.250'
+        >>> half_contrast(torch.tensor([0.9, 0.6, 0.4, 0.1])), half_contrast(torch.tensor([0.4, 0.1]))
+        ('0.250', '0.104')
     """
     frequency, values = [0.0, *ring_centres(len(contrast))], [1.0, *contrast.tolist()]
     for i in range(1, len(values)):
