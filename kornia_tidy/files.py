@@ -6,13 +6,16 @@ No package is used for atomic writes: atomicwrites is unmaintained, and writes n
 from __future__ import annotations
 
 import codecs
+import csv
 import errno
+import io
 import json
+import math
 import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -79,6 +82,30 @@ def check_file(path: str | os.PathLike[str]) -> Path:
     return path
 
 
+def check_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the path of an existing folder.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise FileNotFoundError(f"there is no folder {path}")
+    return path
+
+
+def output_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a folder to write into, which may be missing.
+
+    Raises:
+        ValueError: if something else has its name.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise ValueError(f"cannot write into {path}: it is not a folder")
+    return path
+
+
 def read_text(path: str | os.PathLike[str], errors: str = "strict") -> str:
     r"""Read a text file in UTF-8, or in UTF-8, UTF-16 or UTF-32 with a byte order mark, which is left out.
 
@@ -128,10 +155,47 @@ def read_json(path: str | os.PathLike[str]) -> Any:
         ValueError: if it is not JSON, or is nested too deep; the path is named.
     """
     text = read_text(path)
-    try:
+    with error_prefix(f"cannot read {path}"):
         return parse_json(text)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def read_csv(path: str | os.PathLike[str]) -> list[dict[Any, Any]]:
+    """Read a table of CSV as texts by their headings; cells without a heading stand under None, missing ones are None.
+
+    Raises:
+        FileNotFoundError: if the file is missing.
+        ValueError: if it is no table; the path is named.
+    """
+    text = read_text(path)
+    with error_prefix(f"cannot read {path}", csv.Error):
+        return list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+
+
+def csv_bytes(rows: Iterable[Iterable[Any]]) -> bytes:
+    """Return a table as the bytes of a CSV file, its headings first."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
+
+
+def json_lines(values: Mapping[str, Any]) -> bytes:
+    """Return the bytes of a file of JSON with each entry on a line of its own."""
+    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
+    return f"{{\n{lines}\n}}\n".encode()
+
+
+def standard(value: Any) -> Any:
+    """Return a value as standard JSON can hold it: NaN and infinity as texts.
+
+    Example:
+        >>> standard({"depth_range": (0.5, math.inf)})
+        {'depth_range': [0.5, 'inf']}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): standard(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [standard(entry) for entry in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -196,6 +260,31 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
     """
     with replacing(path) as temporary:
         temporary.write_bytes(data)
+
+
+@contextmanager
+def error_prefix(words: str, *others: type[Exception]) -> Generator[None]:
+    """Put words such as "cannot read FILE" before the message of a ``ValueError`` of a block, unless it has them.
+
+    Args:
+        words: before the message, without the colon.
+        others: types of errors that become a ``ValueError`` too, as those that a damaged file raises.
+
+    Raises:
+        ValueError: with the words.
+
+    Example:
+        >>> with error_prefix("cannot read list.json", TypeError):
+        ...     None["rgb"]
+        Traceback (most recent call last):
+        ...
+        ValueError: cannot read list.json: 'NoneType' object is not subscriptable
+    """
+    try:
+        yield
+    except (ValueError, *others) as error:
+        told = f"{error!s:.500}"
+        raise ValueError(told if told.startswith(words) else f"{words}: {told}") from error
 
 
 @contextmanager

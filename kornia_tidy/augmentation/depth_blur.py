@@ -39,6 +39,10 @@ _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
 # discs are, the farther apart they may be for the same error of their blend.
 _OFFSET, _DENSITY = 1.0, 6.0
 COLOR_SPACES = ("srgb", "linear")
+_ARGUMENTS = (
+    *("focus_distance", "f_number", "focal_length", "pixel_pitch", "max_radius"),
+    *("compositing", "color_space"),
+)
 
 
 def blur_radius(
@@ -290,17 +294,7 @@ class DepthBlur(nn.Module):
 
     def forward(self, image: Tensor, depth: Tensor) -> Tensor:
         """Return the blurred images."""
-        return depth_blur(
-            image,
-            depth,
-            self.focus_distance,
-            self.f_number,
-            self.focal_length,
-            self.pixel_pitch,
-            self.max_radius,
-            self.compositing,
-            self.color_space,
-        )
+        return depth_blur(image, depth, **{name: getattr(self, name) for name in _ARGUMENTS})
 
     def extra_repr(self) -> str:
         """Return a one-line description of the lens."""

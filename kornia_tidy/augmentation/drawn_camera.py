@@ -72,14 +72,9 @@ def _drawn_lens(optics: TiDyOptics, drawn: DrawnOptics) -> ThinLensCamera:
             f"{type(lens).__name__}"
         )
     focus = lens.focus_distance if drawn.focus_distance is None else drawn.focus_distance
-    return ThinLensCamera(
-        lens.focal_length,
-        lens.aperture_diameter if drawn.aperture_diameter is None else drawn.aperture_diameter,
-        float(focus.detach()) if isinstance(focus, Tensor) else focus,
-        lens.pixel_pitch,
-        lens.depth_range,
-        lens.lens_material,
-    )
+    diameter = lens.aperture_diameter if drawn.aperture_diameter is None else drawn.aperture_diameter
+    fixed = focus.detach().item() if isinstance(focus, Tensor) else focus
+    return lens.changed(aperture_diameter=diameter, focus_distance=fixed)
 
 
 def _switching(modulator: nn.Module, switching_time: float, seed: int) -> nn.Module:

@@ -15,17 +15,7 @@ from kornia_tidy.checks import check_float_tensor, check_values
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.psf.field import check_centers
 
-KNOWN = (
-    "IMAGE",
-    "INPUT",
-    "MASK",
-    "BBOX",
-    "BBOX_XYXY",
-    "BBOX_XYWH",
-    "KEYPOINTS",
-    "CLASS",
-    "LABEL",
-)  # kornia's data keys
+KNOWN = tuple(K.container.augment.DataKey.__members__)
 _DEPTH, _VALID = "mask_of_depth", "mask_of_valid_depth"
 
 

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from kornia_tidy.files import read_json, read_text
+from kornia_tidy.files import error_prefix, read_json, read_text
 
 OPTIONS = ("focal_px", "baseline_m", "doffs_px", "scale")
 _ENTRY = re.compile(r"^\s*(\w+)\s*=\s*(\[[^\]]*\]|[-+.\deE]+)\s*$", re.MULTILINE)
@@ -50,10 +50,8 @@ def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
                 f"cannot read {path}: Middlebury's calibration has cam0=[f 0 cx; 0 f cy; 0 0 1], baseline= and doffs="
             )
         values = {"focal_px": camera[0], "baseline_m": entries["baseline"], "doffs_px": entries["doffs"]}
-    try:
+    with error_prefix(f"cannot read {path}", OverflowError, TypeError):
         numbers = {name: float(value) for name, value in values.items()}
-    except (OverflowError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {path}: {error!s:.200}") from error
     if Path(path).suffix.lower() != ".json":
         numbers["baseline_m"] /= 1000  # millimetres
     for name, number in numbers.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from numbers import Integral
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_tidy.data.leaf_textures import paint_leaves
+from kornia_tidy.data.leaf_textures import Leaves, paint_leaves
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
@@ -29,17 +29,6 @@ LARGEST_SLANT = 0.08  # fraction of the dioptre range, from the middle of a leaf
 OUTLINE_POINTS = 120  # divisible by 3, 4, 5 and 6, so that every corner of a polygon is a point
 PEN = 0.6  # px by which cv2.fillPoly grows a shape, since it fills every pixel on the outline
 SUBPIXEL_BITS = 4  # cv2 draws with fixed-point coordinates
-
-
-class Leaves(NamedTuple):
-    """Leaves sorted from far to near; entry 0 is the background."""
-
-    center: NDArray[np.float64]  # (N, 2) x, y in px
-    radius: NDArray[np.float64]  # (N,) px, of the disc with the same area
-    angle: NDArray[np.float64]  # (N,) rad
-    inverse_depth: NDArray[np.float64]  # (N,) normalised inverse depth at the centre, 0 = far, 1 = near end
-    slant: NDArray[np.float64]  # (N, 2) gradient of inverse_depth per px along x and y
-    outline: NDArray[np.float64]  # (N, OUTLINE_POINTS, 2) px
 
 
 def dead_leaves(
@@ -97,7 +86,7 @@ def dead_leaves(
     rng = np.random.default_rng(seed)
     leaves = scatter_leaves(height, width, num_leaves, rng)
     index, inverse_depth = rasterise(height, width, leaves)
-    image = paint_leaves(index, leaves.center, leaves.radius, leaves.angle, rng)
+    image = paint_leaves(index, leaves, rng)
 
     depth = depth_of(inverse_depth, near, far)
     return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))), torch.from_numpy(depth[None])
@@ -156,8 +145,7 @@ class PaintedScenes(SceneDataset):
 
     def read(self, index: int) -> Scene:
         """Paint a scene."""
-        image, depth = self.paint(keyed_seed(self.seed, self.key, index))
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+        return Scene.whole(*self.paint(keyed_seed(self.seed, self.key, index)))
 
 
 class DeadLeaves(PaintedScenes):

@@ -17,10 +17,11 @@ from torch import Tensor
 from kornia_tidy.arrays import check_depth_scale
 from kornia_tidy.checks import check_choice, check_depth, check_float_tensor, check_positive
 from kornia_tidy.data.metadata import with_text
+from kornia_tidy.data.npy import encode_npy
 from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.data.stored import read_stored
-from kornia_tidy.files import replacing, write_bytes
+from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.units import warn_once
 
@@ -248,12 +249,8 @@ def write_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1.0,
         raise ValueError(f"depth must have shape (1, H, W), got {tuple(depth.shape)}")
     check_depth(depth)
     stored = depth[0].detach().double().cpu().numpy() / scale
-    if suffix == ".pfm":
-        write_bytes(path, encode_pfm(stored.astype(np.float32)))
-        return
-    if suffix == ".npy":
-        with replacing(path) as temporary, temporary.open("wb") as file:
-            np.save(file, stored.astype(np.float32))
+    if suffix != ".png":
+        write_bytes(path, (encode_pfm if suffix == ".pfm" else encode_npy)(stored.astype(np.float32)))
         return
     units = np.rint(stored)
     text = f"metres = value * {scale:g}"

@@ -29,6 +29,17 @@ ROUGHEST = 0.05  # largest standard deviation of the grain, relative to the ligh
 STRAY_COLOURS = 0.12  # fraction of leaves with colours of another palette
 
 
+class Leaves(NamedTuple):
+    """Leaves sorted from far to near; entry 0 is the background."""
+
+    center: NDArray[np.float64]  # (N, 2) x, y in px
+    radius: NDArray[np.float64]  # (N,) px, of the disc with the same area
+    angle: NDArray[np.float64]  # (N,) rad
+    inverse_depth: NDArray[np.float64]  # (N,) normalised inverse depth at the centre, 0 = far, 1 = near end
+    slant: NDArray[np.float64]  # (N, 2) gradient of inverse_depth per px along x and y
+    outline: NDArray[np.float64]  # (N, points, 2) px
+
+
 class LeafPixels(NamedTuple):
     """The pixels of a picture, each with its leaf and its place on it; flat arrays."""
 
@@ -46,16 +57,14 @@ class LeafPixels(NamedTuple):
     """Radius of the leaf in pixels."""
 
 
-def leaf_pixels(
-    index: NDArray[np.int32], center: NDArray[np.float64], radius: NDArray[np.float64], angle: NDArray[np.float64]
-) -> LeafPixels:
-    """Return the place of each pixel on its leaf; the arguments are those of :func:`paint_leaves`."""
+def leaf_pixels(index: NDArray[np.int32], leaves: Leaves) -> LeafPixels:
+    """Return the place of each pixel on the leaf that it shows, by the leaf's number, (H, W)."""
     height, width = index.shape
     leaf = index.ravel()
-    x = np.tile(np.arange(width, dtype=np.float32), height) - center.astype(np.float32)[leaf, 0]
-    y = np.repeat(np.arange(height, dtype=np.float32), width) - center.astype(np.float32)[leaf, 1]
-    cos, sin = np.cos(angle).astype(np.float32)[leaf], np.sin(angle).astype(np.float32)[leaf]
-    return LeafPixels(leaf, x, y, cos * x + sin * y, cos * y - sin * x, radius.astype(np.float32)[leaf])
+    x = np.tile(np.arange(width, dtype=np.float32), height) - leaves.center.astype(np.float32)[leaf, 0]
+    y = np.repeat(np.arange(height, dtype=np.float32), width) - leaves.center.astype(np.float32)[leaf, 1]
+    cos, sin = np.cos(leaves.angle).astype(np.float32)[leaf], np.sin(leaves.angle).astype(np.float32)[leaf]
+    return LeafPixels(leaf, x, y, cos * x + sin * y, cos * y - sin * x, leaves.radius.astype(np.float32)[leaf])
 
 
 def pattern_weights(
@@ -81,27 +90,19 @@ def pattern_weights(
     return pattern
 
 
-def paint_leaves(
-    index: NDArray[np.int32],
-    center: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    angle: NDArray[np.float64],
-    rng: Generator,
-) -> Array:
+def paint_leaves(index: NDArray[np.int32], leaves: Leaves, rng: Generator) -> Array:
     """Return the shaded and textured picture of leaves.
 
     Args:
         index: number of the leaf that each pixel shows, (H, W).
-        center: x and y of the leaves in pixels, (N, 2).
-        radius: of the leaves in pixels, (N,).
-        angle: of the leaves' main axes in radians from +x towards +y, (N,).
+        leaves: places, sizes and angles of the leaves.
         rng: generator of colours and textures.
 
     Returns:
         The image, (H, W, 3) RGB, sRGB-encoded in [0, 1]. Textures are not finer than the pixels resolve.
     """
     height, width = index.shape
-    count = len(radius)
+    count = len(leaves.radius)
     colours = _colours(count, rng)
     kind = rng.integers(0, len(TEXTURES), count)
     contrast = (rng.beta(2, 3, count) * (rng.random(count) > SMOOTH)).astype(np.float32)
@@ -110,7 +111,7 @@ def paint_leaves(
     style = rng.random((3, count), dtype=np.float32)  # three numbers, whose meaning depends on the texture
     noise_tile, script_tile = make_noise_tile(rng), make_script_tile(rng)
 
-    pixels = leaf_pixels(index, center, radius, angle)
+    pixels = leaf_pixels(index, leaves)
     leaf, x, y, along, across, size = pixels
 
     # Light from the upper left on surfaces that are a little convex.

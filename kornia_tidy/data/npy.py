@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
@@ -38,10 +39,7 @@ def decode_npy(data: bytes) -> NDArray[Any]:
     Source: NumPy enhancement proposal 1, "A simple file format for NumPy arrays".
 
     Example:
-        >>> import io
-        >>> file = io.BytesIO()
-        >>> np.save(file, np.array([[1, 2]], ">u2"))
-        >>> decode_npy(file.getvalue())
+        >>> decode_npy(encode_npy(np.array([[1, 2]], ">u2")))
         array([[1, 2]], dtype=uint16)
     """
     dtype, fortran_order, shape, start = npy_header(data)
@@ -50,6 +48,13 @@ def decode_npy(data: bytes) -> NDArray[Any]:
         raise ValueError(f"its NPY header promises {expected} bytes of values, there are {found}")
     values = np.frombuffer(data, dtype, offset=start).reshape(shape, order="F" if fortran_order else "C")
     return values.astype(dtype.newbyteorder("="))
+
+
+def encode_npy(values: NDArray[Any]) -> bytes:
+    """Encode an array as an NPY file."""
+    file = io.BytesIO()
+    np.lib.format.write_array(file, values, allow_pickle=False)
+    return file.getvalue()
 
 
 def npy_header(data: bytes) -> tuple[np.dtype[Any], bool, tuple[int, ...], int]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.npy import decode_npy, npy_header
 from kornia_tidy.data.picture_header import check_pixels
+from kornia_tidy.files import error_prefix
 
 MAGIC = b"PK\3\4"
 
@@ -42,10 +43,8 @@ def decode_npz(data: bytes) -> NDArray[Any]:
         >>> decode_npz(file.getvalue())
         array([[1, 2]], dtype=uint16)
     """
-    try:
+    with error_prefix("its ZIP archive is cut short or damaged", *_DAMAGE):
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except _DAMAGE as error:
-        raise ValueError(f"its ZIP archive is cut short or damaged: {error!s:.100}") from error
     members = [member for member in archive.infolist() if not member.is_dir()]
     names = ", ".join(ascii(member.filename)[1:-1] for member in members[:9])[:120]
     if not any(member.filename.endswith(".npy") for member in members):
@@ -64,18 +63,13 @@ def decode_npz(data: bytes) -> NDArray[Any]:
 
 def _unfolded(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
     """Return the bytes of an NPY file in an archive, after a look at its header."""
-    try:
-        with archive.open(member) as file:
-            beginning = file.read(_LONGEST_HEADER)
-    except _DAMAGE as error:
-        raise ValueError(f"its NPZ is damaged: {error!s:.100}") from error
+    with error_prefix("its NPZ is damaged", *_DAMAGE), archive.open(member) as file:
+        beginning = file.read(_LONGEST_HEADER)
     dtype, _, shape, start = npy_header(beginning)
     channels = shape[-1] if len(shape) > 2 and shape[-1] in {1, 2, 3, 4} else 1
     check_pixels("the array", shape[0] if shape else 1, math.prod(shape[1:]) // channels)
     expected = start + dtype.itemsize * math.prod(shape)
     if member.file_size != expected:
         raise ValueError(f"its NPY header promises {expected} bytes, the archive {member.file_size}")
-    try:
+    with error_prefix("its NPZ is damaged", *_DAMAGE):
         return archive.read(member)  # its check sum is compared at the end
-    except _DAMAGE as error:
-        raise ValueError(f"its NPZ is damaged: {error!s:.100}") from error

@@ -13,6 +13,7 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.data.hdf5 import DAMAGE, stored_numbers
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
+from kornia_tidy.files import error_prefix
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.search_path import import_extra, import_installed
 
@@ -70,11 +71,8 @@ class NYUDepthV2(SceneDataset):
     def read(self, index: int) -> Scene:
         """Read a frame."""
         row = self.numbers[index] - 1
-        with _open(self.path) as file:
-            try:
-                image, depth = file["images"][row], file["depths"][row]
-            except DAMAGE as error:
-                raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
+        with _open(self.path) as file, error_prefix(f"cannot read {self.path}", *DAMAGE):
+            image, depth = file["images"][row], file["depths"][row]
         # MATLAB stores columns, HDF5 rows: (480, 640, 3) is read as (3, 640, 480).
         image, depth = image.transpose(0, 2, 1)[:, *INSIDE], np.ascontiguousarray(depth.T[INSIDE], np.float32)
         if not (depth > 0).any():  # False for NaN too
@@ -88,11 +86,8 @@ class NYUDepthV2(SceneDataset):
 
     def _count(self) -> int:
         """Return the number of frames; raise ``ValueError`` if images or depths are missing or of another shape."""
-        with _open(self.path) as file:
-            try:
-                shapes = {key: getattr(stored_numbers(file, key), "shape", None) for key in ("images", "depths")}
-            except (*DAMAGE, ValueError) as error:
-                raise ValueError(f"cannot read {self.path}: {error!s:.200}") from error
+        with _open(self.path) as file, error_prefix(f"cannot read {self.path}", *DAMAGE):
+            shapes = {key: getattr(stored_numbers(file, key), "shape", None) for key in ("images", "depths")}
         images = shapes["images"]
         count = images[0] if images else 0
         height, width = FRAME

@@ -16,9 +16,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
-from kornia_tidy.data.dead_leaves import PaintedScenes, check_arguments, depth_of, rasterise, scatter_leaves
+from kornia_tidy.data.dead_leaves import PaintedScenes, check_arguments, depth_of
 from kornia_tidy.data.image_files import SUFFIXES, as_image
-from kornia_tidy.data.photographic_leaves import LARGEST_RADIUS, ZOOM, of_most, photographed
+from kornia_tidy.data.photographic_leaves import ZOOM, of_most, photographed, scattered
 from kornia_tidy.data.scene_dataset import Transform
 from kornia_tidy.data.stored import read_stored
 from kornia_tidy.files import find_files
@@ -94,10 +94,7 @@ def photo_collage(
         raise ValueError("photographs must hold one path or more, got none")
     near, far = depth_range
     rng = np.random.default_rng(seed)
-    fewest, most = (height * width / pixels for pixels in reversed(PIXELS_A_LEAF))
-    count = max(1, round(fewest * (most / fewest) ** rng.random()))
-    leaves = scatter_leaves(ZOOM * height, ZOOM * width, count, rng, LARGEST_RADIUS)
-    index, inverse_depth = rasterise(ZOOM * height, ZOOM * width, leaves)
+    _, index, inverse_depth = scattered(height, width, rng, PIXELS_A_LEAF)
     image = photographed(_collage(index, photographs, rng).clip(0, 1), rng)
 
     inverse_depth = of_most(inverse_depth)

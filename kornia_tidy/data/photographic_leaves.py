@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from kornia_tidy.data.dead_leaves import PaintedScenes, check_arguments, depth_of, rasterise, scatter_leaves
+from kornia_tidy.data.leaf_textures import Leaves
 from kornia_tidy.data.photographic_textures import photographic_light
 
 ZOOM = 2  # painted pixels along a side of a final one
@@ -65,11 +66,8 @@ def photographic_leaves(
     check_arguments(height, width, depth_range, 1, seed)
     near, far = depth_range
     rng = np.random.default_rng(seed)
-    fewest, most = (height * width / pixels for pixels in reversed(PIXELS_A_LEAF))
-    count = max(1, round(fewest * (most / fewest) ** rng.random()))
-    leaves = scatter_leaves(ZOOM * height, ZOOM * width, count, rng, LARGEST_RADIUS)
-    index, inverse_depth = rasterise(ZOOM * height, ZOOM * width, leaves)
-    light = photographic_light(index, leaves.center, leaves.radius, leaves.angle, ZOOM, rng)
+    leaves, index, inverse_depth = scattered(height, width, rng, PIXELS_A_LEAF)
+    light = photographic_light(index, leaves, ZOOM, rng)
     image = photographed(light.clip(0, 1), rng)
 
     depth = depth_of(of_most(inverse_depth), near, far)
@@ -102,6 +100,16 @@ class PhotographicLeaves(PaintedScenes):
     def paint(self, seed: int) -> tuple[Tensor, Tensor]:
         """Return image and depth of the scene of a seed."""
         return photographic_leaves(self.height, self.width, depth_range=self.depth_range, seed=seed)
+
+
+def scattered(
+    height: int, width: int, rng: Generator, pixels_a_leaf: tuple[float, float]
+) -> tuple[Leaves, NDArray[np.int32], NDArray[np.float64]]:
+    """Return leaves, and the visible one and its inverse depth at each pixel of a scene of ``ZOOM`` times the size."""
+    fewest, most = (height * width / pixels for pixels in reversed(pixels_a_leaf))
+    count = max(1, round(fewest * (most / fewest) ** rng.random()))
+    leaves = scatter_leaves(ZOOM * height, ZOOM * width, count, rng, LARGEST_RADIUS)
+    return leaves, *rasterise(ZOOM * height, ZOOM * width, leaves)
 
 
 def photographed(light: NDArray[np.float32], rng: Generator) -> NDArray[np.float32]:

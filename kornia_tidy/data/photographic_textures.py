@@ -11,6 +11,7 @@ from kornia_tidy.data.leaf_textures import (
     TEXTURES,
     Array,
     LeafPixels,
+    Leaves,
     leaf_pixels,
     make_noise_tile,
     make_script_tile,
@@ -38,21 +39,12 @@ ILLUMINATION = 0.35  # standard deviation of the logarithm of a scene's illumina
 ILLUMINATION_CELLS = 4  # along a side; it is smooth between them
 
 
-def photographic_light(
-    index: NDArray[np.int32],
-    center: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    angle: NDArray[np.float64],
-    zoom: int,
-    rng: Generator,
-) -> Array:
+def photographic_light(index: NDArray[np.int32], leaves: Leaves, zoom: int, rng: Generator) -> Array:
     """Return the light from a picture of leaves.
 
     Args:
         index: number of the leaf that each pixel shows, (H, W).
-        center: x and y of the leaves in pixels, (N, 2).
-        radius: of the leaves in pixels, (N,).
-        angle: of the leaves' main axes in radians from +x towards +y, (N,).
+        leaves: places, sizes and angles of the leaves.
         zoom: pixels painted for one of the final picture, whose pixels bound the fineness of textures.
         rng: generator of colours and textures.
 
@@ -63,7 +55,7 @@ def photographic_light(
     light have independent axes of luminance, blue-yellow and red-green with long tails.
     """
     height, width = index.shape
-    count = len(radius)
+    count = len(leaves.radius)
     base = _log_colours(count, rng)
     change = np.stack([rng.normal(0, PATTERN, count), rng.laplace(0, 0.1, count), rng.laplace(0, 0.05, count)], 1)
     kind = rng.choice(len(TEXTURES), count, p=np.array(WEIGHTS) / sum(WEIGHTS))
@@ -78,7 +70,7 @@ def photographic_light(
     noise_tile, script_tile = make_noise_tile(rng, NOISE_EXPONENT), make_script_tile(rng)
     grain_tile = make_noise_tile(rng)
 
-    pixels = leaf_pixels(index, center, radius, angle)
+    pixels = leaf_pixels(index, leaves)
     leaf, x, y, along, across, size = pixels
     final = LeafPixels(
         leaf, x, y, *((position / zoom).astype(np.float32, copy=False) for position in (along, across, size))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from kornia_tidy.data.depth_files import ray_cosine
 from kornia_tidy.data.rgbd import Scene
 from kornia_tidy.data.rgbd_folder import RGBDFolder
 from kornia_tidy.data.scene_dataset import Transform
-from kornia_tidy.files import find_files
+from kornia_tidy.files import check_folder, find_files
 
 HYPERSIM_FOCAL_PX, HYPERSIM_SIZE = 886.81, (768, 1024)  # of all its images as published
 
@@ -153,9 +152,7 @@ def _folder(
     **options: Any,
 ) -> RGBDFolder:
     """Return the pairs of the first layout that files in the folder have."""
-    root = Path(root)
-    if not root.is_dir():
-        raise FileNotFoundError(f"there is no folder {root}")
+    root = check_folder(root)
     for image, depth in layouts:
         if any(find_files(root, image)) and any(find_files(root, depth)):
             return made(root, image, depth, transform=transform, **options)

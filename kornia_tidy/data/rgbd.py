@@ -31,6 +31,11 @@ class Scene(NamedTuple):
     valid: Tensor
     """(1, H, W) bool, False where depth was unknown and is filled in."""
 
+    @classmethod
+    def whole(cls, image: Tensor, depth: Tensor) -> Scene:
+        """Return a scene whose depth is known everywhere."""
+        return cls(image, depth, torch.ones_like(depth, dtype=torch.bool))
+
     def within(self, side: int) -> Scene:
         """Return the scene in colour, made smaller if its longer side has more pixels.
 

@@ -13,7 +13,7 @@ from kornia_tidy.data.depth_files import check_depth_options
 from kornia_tidy.data.patches import central_crop
 from kornia_tidy.data.rgbd import Scene, check_pairing_options, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import find_files, read_json
+from kornia_tidy.files import check_folder, find_files, read_json
 
 ABOUT = "rgbd.json"
 KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
@@ -190,8 +190,7 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
         )
     for pattern in (image, depth):
         _check_within(pattern)
-    if not root.is_dir():
-        raise FileNotFoundError(f"there is no folder {root}")
+    check_folder(root)
     images, depths = _matches(root, image), _matches(root, depth)
     shared = set(images.values()) & set(depths.values())
     if len(image) < len(depth):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
 from kornia.geometry.transform import resize
 
 from kornia_tidy.checks import check_choice
@@ -47,9 +46,9 @@ def sample_scene(name: str = "table", height: int = 480) -> Scene:
     size = height, max(1, round(height * 4 / 3))
     if name == "leaves":
         image, depth = photographic_leaves(*size, seed=4)
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+        return Scene.whole(image, depth)
     image, depth, _ = read_rgbd(FOLDER / "table.png", FOLDER / "table_depth.png", scale=SCALE)
     if size != image.shape[1:]:
         image = resize(image, size, antialias=True).clamp(0, 1)
         depth = resize(depth, size, interpolation="nearest")
-    return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+    return Scene.whole(image, depth)

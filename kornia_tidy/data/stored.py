@@ -25,7 +25,7 @@ from kornia_tidy.data.picture_header import PNG, check_header, png_chunks
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.data.tiff import decode_tiff
 from kornia_tidy.data.tiff_directories import MAGIC as TIFF
-from kornia_tidy.files import read_bytes
+from kornia_tidy.files import error_prefix, read_bytes
 
 # Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
 _DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
@@ -79,9 +79,8 @@ def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = Fa
         ValueError: if the file is cut short, damaged or of no known format.
     """
     try:
-        stored = _decode(data, depth)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+        with error_prefix(f"cannot read {path}"):
+            stored = _decode(data, depth)
     except MemoryError:
         raise ValueError(f"cannot read {path}: the memory that it needs is not there") from None
     values = stored.values[..., None] if stored.values.ndim == 2 else stored.values

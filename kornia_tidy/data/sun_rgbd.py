@@ -8,7 +8,7 @@ from pathlib import Path
 
 from kornia_tidy.data.rgbd import Scene, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
-from kornia_tidy.files import find_files
+from kornia_tidy.files import check_folder, find_files
 
 DEPTH = "depth_bfx"  # folder of the improved depth
 ROTATED_BITS = 3  # to the left, in the published files
@@ -37,9 +37,7 @@ class SUNRGBD(SceneDataset):
 
     def __init__(self, root: str | os.PathLike[str], *, transform: Transform | None = None) -> None:
         super().__init__(transform)
-        self.root = Path(root)
-        if not self.root.is_dir():
-            raise FileNotFoundError(f"there is no folder {self.root}")
+        self.root = check_folder(root)
         files = chain.from_iterable(find_files(self.root, f"**/{name}/*") for name in ("image", DEPTH))
         folders = sorted({file.parent.parent for file in files})
         frames = [folder for folder in folders if (folder / "image").is_dir() and (folder / DEPTH).is_dir()]

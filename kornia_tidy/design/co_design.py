@@ -82,7 +82,7 @@ class CoDesign:
     def optics(self, fidelity: str | Fidelity = "balanced") -> TiDyOptics:
         """Return the recommended camera with its masks and its sensor, for sRGB images."""
         optics = candidate_optics(self.task, self.recommended)
-        return TiDyOptics(optics.masks, optics.camera, optics.modulator, optics.sensor, fidelity)
+        return TiDyOptics(optics.masks, optics.camera, optics.modulator, optics.sensor, fidelity, lens=optics.lens)
 
 
 def co_design(

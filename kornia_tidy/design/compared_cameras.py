@@ -92,33 +92,26 @@ def _rank(settings: SystemSettings) -> tuple[int, int, float]:
     return settings.masks, settings.depth_classes, settings.camera().f_number
 
 
-def made_up_camera(
-    family: str, num_masks: int, f_number: float, electrons: float, seed: int, lens: ThinLensCamera
-) -> Camera:
+def made_up_camera(family: str, num_masks: int, f_number: float, electrons: float, seed: int) -> Camera:
     """Return a camera with random masks, whose captures the network for any camera restores without training.
 
     Args:
         family: of the masks, see :func:`~kornia_tidy.masks.families.random_masks`.
         num_masks: in one exposure.
-        f_number: of the lens. Its depths end at infinity, and span at most 40 rad of defocus.
+        f_number: of the lens, which is else the default one. Its depths end at infinity, and span at most 40 rad of
+            defocus.
         electrons: of a white pixel at the reference f-number.
         seed: of the masks.
-        lens: whose focal length, pixels and nearest depth it takes.
 
     Example:
-        >>> made_up_camera("spiral", 3, 12.0, 57_000, 0, ThinLensCamera()).f_number
+        >>> made_up_camera("spiral", 3, 12.0, 57_000, 0).f_number
         12.0
     """
     masks = random_masks(family, num_masks, torch.Generator().manual_seed(seed))
+    lens = ThinLensCamera()
     radius = lens.focal_length / (2 * f_number)
     dioptres = min(1 / lens.depth_range[0], MOST_DEFOCUS * REFERENCE_WAVELENGTH / (math.pi * radius**2))
-    camera = ThinLensCamera(
-        lens.focal_length,
-        f_number=f_number,
-        focus_distance=2 / dioptres,
-        pixel_pitch=lens.pixel_pitch,
-        depth_range=(1 / dioptres, math.inf),
-    )
+    camera = ThinLensCamera(f_number=f_number, focus_distance=2 / dioptres, depth_range=(1 / dioptres, math.inf))
     optics = _exposed(TiDyOptics(masks, camera), electrons)
     system = any_camera_system(optics)
     return Camera(optics, system.head, system.settings)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from typing import Any
 
-import numpy as np
 from safetensors.torch import save
 
+from kornia_tidy.data.npy import encode_npy
 from kornia_tidy.design.candidates import Candidate
 from kornia_tidy.design.co_design import CoDesign
 from kornia_tidy.design.design_task import DesignTask
@@ -28,13 +27,10 @@ def design_files(design: CoDesign) -> dict[str, bytes]:
         The state of the recommended camera (``camera.safetensors``), the heights of the best masks in metres
         (``masks.npy``, (K, N, N), whether they are recommended or not) and ``report.json``.
     """
-    heights = io.BytesIO()
     masks = design.verdict.coded.candidate.masks
-    if masks is not None:
-        np.save(heights, masks.heights().detach().double().numpy())
     return {
         CAMERA: save({name: value.contiguous() for name, value in design.optics().state_dict().items()}),
-        MASKS: heights.getvalue(),
+        MASKS: b"" if masks is None else encode_npy(masks.heights().detach().double().numpy()),
         DATA: (json.dumps(report_data(design), indent=1, allow_nan=False) + "\n").encode(),
     }
 

@@ -130,7 +130,7 @@ def leaf_scenes(count: int, size: int, depth_range: tuple[float, float], seed: i
         key = keyed_seed(seed, "leaves", number)
         image, depth = dead_leaves(2 * size, 2 * size, depth_range=depth_range, num_leaves=leaves, seed=key)
         light = torch.nn.functional.avg_pool2d(rgb_to_linear_rgb(image[None]), 2)
-        scenes.append(Scene(linear_rgb_to_rgb(light)[0], depth[:, ::2, ::2], torch.ones(1, size, size).bool()))
+        scenes.append(Scene.whole(linear_rgb_to_rgb(light)[0], depth[:, ::2, ::2]))
     return scenes
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 from collections.abc import Sequence
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, new_figure, open_chart, require_matplotlib
-from kornia_tidy.files import read_text
+from kornia_tidy.files import error_prefix, read_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,12 +66,10 @@ def draw_learning_curve(folder: str | os.PathLike[str]) -> Figure:
     if not losses or not scores:
         raise ValueError(f"there is nothing to draw: the run in {folder} has no validated epoch yet")
     require_matplotlib()
-    try:
+    with error_prefix(f"the logs of the run in {folder} are damaged", KeyError):
         numbers = np.array([[float(row["step"]), float(row["loss"])] for row in losses])
         name, decibels = _decibels(scores)
         steps = [int(row["step"]) for row in scores]
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"the logs of the run in {folder} are damaged: {error!s:.200}") from error
     return _drawn(Path(folder), numbers, name, decibels, steps)
 
 
@@ -109,9 +105,4 @@ def _decibels(scores: list[dict[str, str]]) -> tuple[str, list[float]]:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    text = read_text(path)
-    try:
-        rows = list(csv.DictReader(io.StringIO(text, newline="")))
-    except (csv.Error, ValueError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
-    return [row for row in rows if None not in row and None not in row.values()]
+    return [row for row in read_csv(path) if None not in row and None not in row.values()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import overload
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in a
 # Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
 NEAREST_DEPTH = 1e-18  # metres
+_LENGTHS = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch", "depth_range", "lens_material")
 DEFAULT_DIAMETER = 2.835e-3  # metres; psi of the paper's range at the default focus
 
 
@@ -67,13 +68,9 @@ def _number(value: float | Tensor) -> float:
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 
-@overload
-def _at_least_float32(value: Tensor) -> Tensor: ...
-@overload
-def _at_least_float32(value: float | Tensor) -> float | Tensor: ...
-def _at_least_float32(value: float | Tensor) -> float | Tensor:
+def _at_least_float32(value: Tensor) -> Tensor:
     """Cast half precision to float32: its rounding would shift the defocus by up to a twentieth of a radian."""
-    return value.to(torch.promote_types(value.dtype, torch.float32)) if isinstance(value, Tensor) else value
+    return value.to(torch.promote_types(value.dtype, torch.float32))
 
 
 class ThinLensCamera(nn.Module):
@@ -182,7 +179,8 @@ class ThinLensCamera(nn.Module):
     @property
     def image_distance(self) -> float | Tensor:
         """Distance s' from the lens to the sensor in metres, 1 / (1/f - 1/z_f)."""
-        return 1 / (1 / self.focal_length - 1 / _at_least_float32(self.focus_distance))
+        focus = self.focus_distance
+        return 1 / (1 / self.focal_length - 1 / (_at_least_float32(focus) if isinstance(focus, Tensor) else focus))
 
     def chromatic_defocus(self, wavelength: float) -> float:
         r"""Return the chromatic focal shift: defocus at a wavelength minus defocus at 530 nm, the same at every depth.
@@ -268,15 +266,16 @@ class ThinLensCamera(nn.Module):
             1.6e-05
         """
         check_positive("scale", scale)
-        focus = self.focus_distance
-        return ThinLensCamera(
-            self.focal_length,
-            self.aperture_diameter,
-            focus.detach() if isinstance(focus, Tensor) else focus,
-            self.pixel_pitch / scale,
-            self.depth_range,
-            self.lens_material,
-        )
+        return self.changed(pixel_pitch=self.pixel_pitch / scale)
+
+    def changed(self, **arguments: Any) -> ThinLensCamera:
+        """Return this camera with other arguments. A learnable focus stays one, with a parameter of the new camera's.
+
+        Example:
+            >>> ThinLensCamera().changed(focus_distance=1.0).extra_repr()[:30]
+            '50 mm f/17.6, focus at 1 m, pi'
+        """
+        return ThinLensCamera(**{name: getattr(self, name) for name in _LENGTHS} | arguments)
 
     @classmethod
     def for_scene(

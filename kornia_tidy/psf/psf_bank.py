@@ -13,7 +13,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_finite, check_number, check_values, described
-from kornia_tidy.files import write_bytes
+from kornia_tidy.files import error_prefix, write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
 STRAY_LIGHT = ("renormalize", "veil", "discard")
@@ -193,13 +193,11 @@ class BankOfPSFs:
             raise ValueError(f"{path} is not a {cls.words}: its format is {found!r:.40} with {sorted(tensors)!r:.200}")
         for name, value in tensors.items():
             check_finite(f"{name} of {path}", value)
-        try:
+        with error_prefix(f"cannot read {path}"):
             bank = cls(**tensors)
             _check_ascending(bank.defocus)
             if "field" not in names:  # between places that were measured, a thin plate may undershoot
                 _check_light("psfs", bank.psfs)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from None
         return bank
 
 

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.choices import PRETRAINED
-from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.files import error_prefix, output_folder, read_json, standard, write_bytes
 from kornia_tidy.reconstruction.half_precision import halved
 from kornia_tidy.reconstruction.model_card import check_license, model_card
 from kornia_tidy.reconstruction.settings import RENAMED
@@ -78,9 +78,7 @@ def save_pretrained(
         >>> system.settings.task, system.step > 0
         ('edof', True)
     """
-    folder = Path(save_directory)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
+    folder = output_folder(save_directory)
     check_license(license)
     weights = _weights(system)
     if half:
@@ -93,10 +91,8 @@ def save_pretrained(
         "global_step": system.step,
         "record": dict(system.record if record is None else record),
     }
-    try:
-        text = json.dumps(_standard(config), indent=2, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"record and run must be plain values for JSON: {error}") from error
+    with error_prefix("record and run must be plain values for JSON", TypeError):
+        text = json.dumps(standard(config), indent=2, allow_nan=False)
     read_back = _state(json.loads(text), weights, "the system")
     again = system_of_state(read_back, "the system")  # refuses settings that do not describe camera and network
     card = model_card(again._replace(record=config["record"]), folder.absolute().name, license)
@@ -188,15 +184,6 @@ def _state(config: Mapping[str, Any], weights: Mapping[str, Tensor], name: str) 
         known["focus_distance"] = math.inf
     psfs, others = below(weights, PSFS), {k: v for k, v in weights.items() if not k.startswith(PSFS)}
     return {"settings": known, "global_step": config.get("global_step"), "state_dict": others, "psfs": psfs}
-
-
-def _standard(value: Any) -> Any:
-    """Return a value as standard JSON can hold it: NaN and infinity as texts."""
-    if isinstance(value, Mapping):
-        return {str(key): _standard(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_standard(entry) for entry in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _download(repository: str, file: str, options: Mapping[str, Any]) -> Path:

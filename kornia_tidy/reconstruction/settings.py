@@ -19,7 +19,7 @@ from kornia_tidy.choices import (
     Start,
     StrayLight,
 )
-from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.files import error_prefix, read_json, write_bytes
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS, HEADS, check_head, check_repeats
 from kornia_tidy.settings import (
     DepthRange,
@@ -308,7 +308,5 @@ class SystemSettings(NetworkSettings, CaptureSettings, LensSettings, MaskSetting
             ValueError: if the file does not hold JSON of settings.
         """
         values = read_json(path)
-        try:
+        with error_prefix(f"cannot read {path}"):
             return cls.from_dict(values)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from error

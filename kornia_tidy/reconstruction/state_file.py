@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
-from kornia_tidy.files import parse_json, replacing
+from kornia_tidy.files import error_prefix, parse_json, replacing
 from kornia_tidy.reconstruction.eight_bits import EightBits
 from kornia_tidy.tensor_files import read_tensors
 
@@ -68,14 +68,12 @@ def read_state(path: str | os.PathLike[str]) -> dict[str, Any]:
         eight bits take four times theirs, and the header, of at most 16 MiB, up to 50 times.
     """
     tensors, header = read_tensors(path, WHAT)
-    try:
+    with error_prefix(f"cannot read {path}: it is no {WHAT} or is damaged", KeyError, TypeError):
         if header.get("format") != FORMAT:
             raise ValueError(f"its format is {header.get('format')!r}, not {FORMAT!r}")
         state = _decode(parse_json(header["state"]), dict(tensors))
         if not isinstance(state, dict):
             raise ValueError(f"its state is a {type(state).__name__}")
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {path}: it is no {WHAT} or is damaged: {error!s:.300}") from error
     return state
 
 

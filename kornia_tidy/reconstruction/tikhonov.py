@@ -270,14 +270,10 @@ def _fourier_matrix(psfs: Tensor, side: int, count: int) -> Tensor:
     return torch.polar(torch.ones_like(phase), phase).to(torch.promote_types(psfs.dtype, torch.complex64))
 
 
-def _spectra(
-    capture: Tensor, psfs: Tensor, weight: float | Tensor, veil: Tensor | None, border: str
-) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """Return the half spectra of the extended capture and of the PSFs on its plane, and the size of the plane."""
+def plane_of(capture: Tensor, psfs: Tensor, border: str) -> tuple[int, int]:
+    """Check capture and PSFs, and return the size of the periodic plane on which they are transformed."""
     check_float_tensor("capture", capture, 4, "(B, C, H, W)")
     check_choice("border", border, BORDERS)
-    if not isinstance(weight, Tensor):
-        check_positive("weight", weight)
     channels, side, width = psfs.shape[-3:]
     if side != width or side % 2 == 0 or channels != capture.shape[1]:
         raise ValueError(
@@ -285,7 +281,16 @@ def _spectra(
             f"got {tuple(psfs.shape)}"
         )
     rows, columns = capture.shape[-2:]
-    size = (next_fast_size(rows + side), next_fast_size(columns + side)) if border == "smooth" else (rows, columns)
+    return (next_fast_size(rows + side), next_fast_size(columns + side)) if border == "smooth" else (rows, columns)
+
+
+def _spectra(
+    capture: Tensor, psfs: Tensor, weight: float | Tensor, veil: Tensor | None, border: str
+) -> tuple[Tensor, Tensor, tuple[int, int]]:
+    """Return the half spectra of the extended capture and of the PSFs on its plane, and the size of the plane."""
+    if not isinstance(weight, Tensor):
+        check_positive("weight", weight)
+    size = plane_of(capture, psfs, border)
     captured = _spectrum(capture, size, psfs.dtype)
     precise = captured.real.dtype
     veil = None if veil is None else veil.to(precise)

@@ -40,14 +40,9 @@ def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
         >>> kernel.shape, round(kernel.sum().item(), 5)
         (torch.Size([1, 1, 19, 19]), 2.0)
     """
-    check_float_tensor("psf", psf, 3, "(C, P, P)")
-    side = psf.shape[-1]
-    if psf.shape[-2] != side or side % 2 == 0:
-        raise ValueError(f"psf must have shape (C, P, P) with P odd, got {tuple(psf.shape)}")
+    window, size = window_and_plane("psf", psf, "(C, P, P)")
     for weight in weights:
         check_positive("weight", weight)
-    window = side + 2 * MARGIN
-    size = next_fast_size(4 * window)  # kernels decay slowly and must not wrap around
     transfer = torch.fft.rfft2(psf, s=(size, size))
     power = transfer.real.square() + transfer.imag.square()
     centred = torch.fft.rfft2(_point(psf), s=(size, size))  # of a PSF that is a point at its centre
@@ -55,6 +50,16 @@ def tikhonov_kernels(psf: Tensor, weights: tuple[float, ...]) -> Tensor:
     gammas = psf.new_tensor(weights)[:, None, None, None]
     inverse = torch.fft.irfft2((transfer.conj() + gammas * centred.conj() / energy) / (power + gammas), s=(size, size))
     return centred_window(inverse, window, psf.sum((-2, -1)))
+
+
+def window_and_plane(name: str, psfs: Tensor, axes: str) -> tuple[int, int]:
+    """Check PSFs, and return the sides of their kernels and of the plane on which these are computed."""
+    check_float_tensor(name, psfs, axes.count(",") + 1, axes)
+    side = psfs.shape[-1]
+    if psfs.shape[-2] != side or side % 2 == 0:
+        raise ValueError(f"{name} must have shape {axes} with P odd, got {tuple(psfs.shape)}")
+    window = side + 2 * MARGIN
+    return window, next_fast_size(4 * window)  # kernels decay slowly and must not wrap around
 
 
 def centred_window(inverse: Tensor, window: int, energy: Tensor) -> Tensor:

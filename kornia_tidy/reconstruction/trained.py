@@ -14,6 +14,7 @@ from kornia_tidy.camera.saved_parts import below, masks_of_state
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_finite
 from kornia_tidy.fidelity import Fidelity
+from kornia_tidy.files import error_prefix
 from kornia_tidy.masks.base import PhaseMasks
 from kornia_tidy.masks.fresnel import FresnelLens
 from kornia_tidy.masks.initial_heights import initial_heights
@@ -215,17 +216,13 @@ def system_of_state(state: Mapping[str, Any], path: str | os.PathLike[str]) -> T
             f"{path} does not say how its camera and network were made, as they were given as objects: make them anew "
             f"and use load_weights"
         )
-    try:
+    with error_prefix(f"cannot read {path}"):
         known, run = SystemSettings.split(state["settings"])
         settings = SystemSettings(**known)
         check_imported(settings.head)
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
     _check_sizes(state, settings, str(path))
-    try:
+    with error_prefix(f"cannot read {path}"):
         optics = build_optics(settings, stored_psfs(state))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
     head = build_head(settings)
     load_weights(state, optics, head, str(path))
     with torch.no_grad():
@@ -288,11 +285,9 @@ def _check_sizes(state: Mapping[str, Any], settings: SystemSettings, name: str) 
             f"cannot read {name}: PSFs of window {settings.window} at {depths} depths must take at most "
             f"{MOST_PSFS >> 20} MiB, got {size >> 20}"
         )
-    try:
-        with torch.device("meta"):  # shapes without memory
-            head = build_head(settings)
-    except RuntimeError as error:
-        raise ValueError(f"cannot read {name}: no network can be made by its settings: {error}") from error
+    named = error_prefix(f"cannot read {name}: no network can be made by its settings", RuntimeError)
+    with named, torch.device("meta"):  # shapes without memory
+        head = build_head(settings)
     prefix = head_prefix(state["state_dict"])
     check_weights(head, below(state["state_dict"], prefix), f"{name}, {prefix.removesuffix('.')}")
 
@@ -355,10 +350,8 @@ def load_camera(path: str | os.PathLike[str]) -> TiDyOptics | None:
     """
     state = camera_state(path)
     if EXTRA_STATE in state:
-        try:
+        with error_prefix(f"cannot read {path}"):
             return camera_of_state(state)
-        except ValueError as error:
-            raise ValueError(f"cannot read {path}: {error}") from error
     checkpoint = read_tensors(path, WHAT)[1].get("format") is not None
     return load_trained(path).optics if checkpoint else None
 

@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from kornia_tidy.checks import check_choice, check_float_tensor, check_number, check_part
+from kornia_tidy.checks import check_float_tensor, check_number, check_part
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.periodic import periodic_extension
-from kornia_tidy.reconstruction.tikhonov import BORDERS, Inversion, transfer_function
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.reconstruction.tikhonov import Inversion, plane_of, transfer_function
 from kornia_tidy.sensor.sensor import SensorNoise
 
 
@@ -69,7 +68,10 @@ def wiener(
         >>> wiener(capture, points, 1e-4, border="circular").flatten() > 0.99
         tensor([False,  True, False, False])
     """
-    size = _plane(capture, psfs, noise, border)
+    check_float_tensor("psfs", psfs, 4, "(D, C, P, P)")
+    if not isinstance(noise, Tensor):
+        _check_noise(noise)
+    size = plane_of(capture, psfs, border)
     if not len(capture):
         return capture.clone()
     precise = torch.promote_types(torch.promote_types(capture.dtype, psfs.dtype), torch.float32)
@@ -225,20 +227,3 @@ def _check_noise(noise: float) -> None:
     check_number("noise", noise, "units of full scale")
     if not 0 <= noise < float("inf"):
         raise ValueError(f"noise must be a standard deviation of at least 0 in units of full scale, got {noise}")
-
-
-def _plane(capture: Tensor, psfs: Tensor, noise: float | Tensor, border: str) -> tuple[int, int]:
-    """Check the arguments and return the size of the plane on which the capture is transformed."""
-    check_float_tensor("capture", capture, 4, "(B, C, H, W)")
-    check_float_tensor("psfs", psfs, 4, "(D, C, P, P)")
-    check_choice("border", border, BORDERS)
-    if not isinstance(noise, Tensor):
-        _check_noise(noise)
-    channels, side, width = psfs.shape[-3:]
-    if side != width or side % 2 == 0 or channels != capture.shape[1]:
-        raise ValueError(
-            f"PSFs must be (D, {capture.shape[1]}, P, P) with P odd for a capture of {capture.shape[1]} channels, "
-            f"got {tuple(psfs.shape)}"
-        )
-    rows, columns = capture.shape[-2:]
-    return (next_fast_size(rows + side), next_fast_size(columns + side)) if border == "smooth" else (rows, columns)

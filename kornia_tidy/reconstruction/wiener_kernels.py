@@ -5,11 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_float_tensor, check_positive
+from kornia_tidy.checks import check_positive
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
-from kornia_tidy.reconstruction.tikhonov_kernels import MARGIN, centred_window
+from kornia_tidy.reconstruction.tikhonov_kernels import centred_window, window_and_plane
 from kornia_tidy.reconstruction.wiener import inverse_spectrum
-from kornia_tidy.render.borders import next_fast_size
 
 
 def wiener_kernels(psfs: Tensor, noises: tuple[float, ...], statistics: SceneStatistics = PHOTOGRAPHS) -> Tensor:
@@ -46,14 +45,9 @@ def wiener_kernels(psfs: Tensor, noises: tuple[float, ...], statistics: SceneSta
         >>> kernel.shape, round(kernel.sum().item(), 3), round(kernel.max().item(), 2)
         (torch.Size([1, 1, 19, 19]), 2.0, 2.0)
     """
-    check_float_tensor("psfs", psfs, 4, "(D, C, P, P)")
-    side = psfs.shape[-1]
-    if psfs.shape[-2] != side or side % 2 == 0:
-        raise ValueError(f"psfs must have shape (D, C, P, P) with P odd, got {tuple(psfs.shape)}")
+    window, size = window_and_plane("psfs", psfs, "(D, C, P, P)")
     for noise in noises:
         check_positive("noise", noise)
-    window = side + 2 * MARGIN
-    size = next_fast_size(4 * window)  # kernels decay slowly and must not wrap around
     places = torch.linspace(-1.0, 1.0, len(psfs), dtype=torch.float64)
     shares = statistics.depth_weights(places).to(psfs)[:, None, None, None]
     transfer = torch.fft.rfft2(psfs, s=(size, size))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import time
 from collections.abc import Mapping
@@ -14,7 +12,7 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from kornia_tidy.files import read_text, write_bytes
+from kornia_tidy.files import csv_bytes, read_text, write_bytes
 from kornia_tidy.training.pictures import draw_pictures
 from kornia_tidy.training.random_state import own_random_state, random_states, set_random_state
 
@@ -171,12 +169,9 @@ class DrawPictures(pl.Callback):
 
 def append_row(path: Path, row: Mapping[str, float]) -> None:
     """Append a line to a CSV file; a new file starts with a heading."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(row)
-        writer.writerow(row.values())
+    heading = [] if path.exists() else [row]
+    with path.open("ab") as file:
+        file.write(csv_bytes([*heading, row.values()]))
 
 
 def drop_rows_after(path: Path, step: int) -> None:
@@ -187,6 +182,4 @@ def drop_rows_after(path: Path, step: int) -> None:
     heading, *rows = [line.split(",") for line in read_text(path, "replace").splitlines()] or [[]]
     place = heading.index("step") if "step" in heading else 0
     kept = [row for row in rows if len(row) == len(heading) and row[place].isdigit() and int(row[place]) <= step]
-    text = io.StringIO(newline="")
-    csv.writer(text).writerows([heading, *kept])
-    write_bytes(path, text.getvalue().encode())
+    write_bytes(path, csv_bytes([heading, *kept]))

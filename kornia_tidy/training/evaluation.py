@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import os
@@ -16,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from kornia_tidy.data.image_files import write_image
-from kornia_tidy.files import write_bytes
+from kornia_tidy.files import csv_bytes, write_bytes
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.metrics import defocus_scores, depth_scores, image_scores, rmse
@@ -168,11 +166,7 @@ def mean_row(rows: Sequence[Row]) -> Row:
 
 def write_table(folder: str | os.PathLike[str], rows: Sequence[Row], about: dict[str, Any]) -> None:
     """Write ``results.csv``, one line per scene, and ``summary.json`` with the means and ``about``."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_bytes(Path(folder) / "results.csv", text.getvalue().encode())
+    write_bytes(Path(folder) / "results.csv", csv_bytes([rows[0], *([row[name] for name in rows[0]] for row in rows)]))
     summary = {**about, "scenes": len(rows), "mean": mean_row(rows)}
     write_bytes(Path(folder) / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
-import io
 import json
 import os
 from collections.abc import Mapping
@@ -17,11 +15,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.data.npy import decode_npy
-from kornia_tidy.files import read_bytes, read_json, write_bytes
+from kornia_tidy.data.npy import decode_npy, encode_npy
+from kornia_tidy.files import error_prefix, read_bytes, read_json, write_bytes
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.render.repeatable import repeatable
 from kornia_tidy.seeds import keyed_seed
+from kornia_tidy.training.coded_datasets.conditions import camera_digest
 from kornia_tidy.training.random_state import seeded
 
 LEVELS = 2**16 - 1  # of stored values: their rounding is 230 times below the least noise in training, 0.001
@@ -79,7 +78,7 @@ class NoiseFreeCaptures(Dataset):
         self.scenes, self.folder = scenes, Path(folder)
         self.optics = copy.deepcopy(optics).requires_grad_(requires_grad=False)
         self.optics.sensor = None
-        conditions = {"camera": _digest(self.optics), "set of scenes": dict(made_from or {})}
+        conditions = {"camera": camera_digest(self.optics, settings=True), "set of scenes": dict(made_from or {})}
         self.optics.color_space = "linear"
         self.decode = optics.decode
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -98,14 +97,10 @@ class NoiseFreeCaptures(Dataset):
         path = self.folder / f"{index:06d}.npy"
         if not path.exists():
             planes = self._render(index)
-            file = io.BytesIO()
-            np.save(file, planes)
-            write_bytes(path, file.getvalue())
+            write_bytes(path, encode_npy(planes))
         else:
-            try:
+            with error_prefix(f"{path} is damaged, delete it to have it rendered again"):
                 planes = decode_npy(read_bytes(path))
-            except ValueError as error:
-                raise ValueError(f"{path} is damaged, delete it to have it rendered again: {error}") from error
         values = torch.from_numpy(planes.astype(np.float32)) / LEVELS
         return NoiseFreeCapture(values[:3], values[3:6], values[6:7], values[7:] > 0)
 
@@ -120,14 +115,6 @@ class NoiseFreeCaptures(Dataset):
         inverse_depth = normalised_inverse_depth(self.optics.camera, sample["depth"])
         planes = torch.cat([sample["image"], sample["all_in_focus"], inverse_depth, sample["mask"].float()], 1)[0]
         return (planes.clamp(0, 1) * LEVELS).round().numpy().astype(np.uint16)
-
-
-def _digest(optics: TiDyOptics) -> str:
-    """Return a hash of the camera's weights, settings and aperture."""
-    digest = hashlib.sha256()
-    for name, value in {**optics.state_dict(), "aperture": optics.pupil.amplitude}.items():
-        digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def _claim(path: Path, conditions: Mapping[str, Any]) -> None:

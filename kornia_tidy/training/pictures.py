@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,23 +12,15 @@ from torch import Tensor
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.image_files import write_image
 
+if TYPE_CHECKING:
+    from kornia_tidy.training.module import BatchResult
+
 SCALE, GAP = 4, 2  # picture pixels per pixel of a mask or PSF; picture pixels between two of them
 DEPTHS, SCENES = 7, 4  # drawn, at most
 ERROR_SCALE = 3.0  # of error maps, so that small errors are visible
 
 
-class BatchMaps(Protocol):
-    """Captures, estimates and true maps of a batch, see :class:`kornia_tidy.training.module.BatchResult`."""
-
-    @property
-    def coded(self) -> Tensor: ...  # noqa: D102
-    @property
-    def estimate(self) -> dict[str, Tensor]: ...  # noqa: D102
-    @property
-    def truth(self) -> dict[str, Tensor]: ...  # noqa: D102
-
-
-def draw_pictures(optics: TiDyOptics, result: BatchMaps, folder: Path, epoch: int) -> dict[str, Tensor]:
+def draw_pictures(optics: TiDyOptics, result: BatchResult, folder: Path, epoch: int) -> dict[str, Tensor]:
     """Write masks, PSFs and estimates to PNG files named by the epoch, and return the pictures, (3, H, W)."""
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {"masks": masks_picture(optics), "psfs": psfs_picture(optics), "estimates": estimates_picture(result)}
@@ -59,7 +51,7 @@ def psfs_picture(optics: TiDyOptics) -> Tensor:
     return _grid([[enlarged((psf / psf.max().clamp(min=1e-30)).clamp(min=0).sqrt()) for psf in light]])
 
 
-def estimates_picture(result: BatchMaps) -> Tensor:
+def estimates_picture(result: BatchResult) -> Tensor:
     """Return one row per scene: the capture, then for each map estimate, true map, and :func:`error_map`."""
     rows = []
     for i in range(min(SCENES, len(result.coded))):

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
-from pathlib import Path
 from typing import Any
 
-from kornia_tidy.files import read_json, read_text
+from kornia_tidy.files import check_folder, error_prefix, read_csv, read_json
 
 EVALUATION, VALIDATION = "evaluation/summary.json", "validation.csv"
 
@@ -34,23 +31,17 @@ def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
         ...     training_record(folder)
         {'validation': [{'epoch': '0', 'val_loss': '0.5'}]}
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"there is no folder {folder}")
+    folder = check_folder(folder)
     record: dict[str, Any] = {}
     if (summary := folder / EVALUATION).exists():
         about = read_json(summary)
-        try:
+        with error_prefix(
+            f"cannot read {summary}: it is no summary of an evaluation", AttributeError, KeyError, TypeError
+        ):
             test_set = f"{about['settings']['data']}, {about['split']}, {about['scenes']} scenes"
             record["scores"] = {test_set: {str(name): float(value) for name, value in about["mean"].items()}}
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"cannot read {summary}: it is no summary of an evaluation: {error!r:.80}") from error
     if (validation := folder / VALIDATION).exists():
-        text = read_text(validation)
-        try:
-            record["validation"] = list(csv.DictReader(io.StringIO(text), strict=True))
-        except (csv.Error, ValueError) as error:
-            raise ValueError(f"cannot read {validation}: {error}") from error
+        record["validation"] = read_csv(validation)
     if not record:
         raise FileNotFoundError(f"{folder} has neither {EVALUATION} nor {VALIDATION}: it is no folder of a run")
     return record

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from kornia_tidy.camera.saved_parts import below
-from kornia_tidy.files import only_here
+from kornia_tidy.files import error_prefix, only_here, output_folder
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead, with_fine_maps
@@ -99,7 +99,7 @@ def train(
     """
     if refiner_from is not None and not settings.refined:
         raise ValueError("a network begins the refiner of refined, which is not asked for")
-    folder = Path(folder)
+    folder = output_folder(folder)
     goes_on = resume and (folder / LAST).exists()
     if settings.learn == "masks" and settings.head not in CLOSED_FORMS and head_from is None and not goes_on:
         raise ValueError(
@@ -107,8 +107,6 @@ def train(
             f"head_from, or take a head without weights, {' or '.join(CLOSED_FORMS)}"
         )
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
     folder.mkdir(parents=True, exist_ok=True)
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
         stored = folder / "captures" if captures is None else Path(captures)
@@ -207,7 +205,9 @@ def _train(
             **options,
         )
         if stored is not None:
-            _check_run(stored, checkpoint, trainer, module, data)
+            batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
+            with error_prefix(f"cannot resume from {checkpoint}"):
+                check_stored_run(stored, trainer, module, batches)
         _fit(trainer, module, data, checkpoint)
     return module
 
@@ -226,17 +226,6 @@ def _same_psfs(
     if given is not None and (stored is None or not torch.equal(given.psfs, stored.psfs)):
         raise ValueError(f"cannot resume from {path}: its PSFs are not those that are given")
     return stored
-
-
-def _check_run(
-    state: Mapping[str, Any], path: Path | None, trainer: pl.Trainer, module: TidyTraining, data: SceneData
-) -> None:
-    """Raise ``ValueError`` with the path unless a run can go on from a state."""
-    batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
-    try:
-        check_stored_run(state, trainer, module, batches)
-    except ValueError as error:
-        raise ValueError(f"cannot resume from {path}: {error}") from None
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:

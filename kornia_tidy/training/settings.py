@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from kornia_tidy.design.settings import DesignSettings
+from kornia_tidy.files import error_prefix
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS, FIXED
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.settings import Count, CountOrNone, Factor, FNumber, Pixels, Unit, one_of
@@ -196,10 +197,8 @@ class TrainingSettings(LearningSettings, LightSettings, SceneSettings, SystemSet
         Raises:
             ValueError: if the system's checkpoint holds a name that is unknown or a value that is not allowed.
         """
-        try:
+        with error_prefix("the checkpoint's settings of its run cannot be used"):
             return cls.from_dict({**system.settings.as_dict(), **system.run})
-        except ValueError as error:
-            raise ValueError(f"the checkpoint's settings of its run cannot be used: {error}") from error
 
 
 def usual_settings(given: Mapping[str, Any]) -> dict[str, Any]:

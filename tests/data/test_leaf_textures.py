@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kornia_tidy.data.leaf_textures import TEXTURES, make_noise_tile, make_script_tile, paint_leaves
+from kornia_tidy.data.leaf_textures import TEXTURES, Leaves, make_noise_tile, make_script_tile, paint_leaves
 from tests.base import BaseTester
 
 
 def paint(index: np.ndarray, seed: int) -> np.ndarray:
     """Two leaves side by side, 64 px high."""
     center = np.array([[16.0, 32.0], [48.0, 32.0]])
-    rng = np.random.default_rng(seed)
-    return paint_leaves(index.astype(np.int32), center, np.array([40.0, 25.0]), np.array([0.3, 2.0]), rng)
+    flat = np.zeros(2), np.zeros((2, 2)), np.zeros((2, 1, 2))
+    leaves = Leaves(center, np.array([40.0, 25.0]), np.array([0.3, 2.0]), *flat)
+    return paint_leaves(index.astype(np.int32), leaves, np.random.default_rng(seed))
 
 
 class TestPaintLeaves(BaseTester):

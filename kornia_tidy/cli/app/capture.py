@@ -137,7 +137,7 @@ def painted(name: str, height: int, width: int, depth_range: tuple[float, float]
         image, depth = dead_leaves(height, width, depth_range=depth_range, num_leaves=leaves, seed=seed)
     else:
         image, depth = photographic_leaves(height, width, depth_range=depth_range, seed=seed)
-    return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))
+    return Scene.whole(image, depth)
 
 
 def own_camera(settings: Settings, scene: Scene) -> ThinLensCamera:

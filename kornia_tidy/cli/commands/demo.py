@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import MASK_FAMILIES
-from kornia_tidy.cli.commands.shared import Folder, OwnScene, check_folder
+from kornia_tidy.cli.commands.shared import Folder, OwnScene
 from kornia_tidy.design.settings import DesignSettings
+from kornia_tidy.files import output_folder
 from kornia_tidy.settings import FNumber, Pixels, Seed, Unit, one_of
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class Demo:
 
     def run(self) -> None:
         """Simulate captures, restore them, and write the two pages."""
-        folder = check_folder(self.output)
+        folder = output_folder(self.output)
         import torch
 
         from kornia_tidy.cli.commands.report import clamped_in_words, progress_bar, scene_in_words, tell
@@ -117,18 +118,11 @@ class Demo:
     def _cameras(self) -> dict[str, Camera]:
         """Return the shipped cameras, or the one that is made up in place of that with masks."""
         from kornia_tidy.design.compared_cameras import REFERENCE_F_NUMBER, made_up_camera, shipped_cameras
-        from kornia_tidy.optics.thin_lens import ThinLensCamera
 
         cameras = shipped_cameras(self.electrons)
         if (self.masks, self.family, self.f_number) != (None, None, None):
-            cameras["coded"] = made_up_camera(
-                self.family or "pixelwise",
-                self.masks or 5,
-                self.f_number or REFERENCE_F_NUMBER,
-                self.electrons,
-                self.seed,
-                ThinLensCamera(),
-            )
+            family, masks, f_number = self.family or "pixelwise", self.masks or 5, self.f_number or REFERENCE_F_NUMBER
+            cameras["coded"] = made_up_camera(family, masks, f_number, self.electrons, self.seed)
         return cameras
 
     def _scene(self, camera: ThinLensCamera) -> Scene:

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 from kornia_tidy.choices import BETWEEN
-from kornia_tidy.cli.commands.shared import Folder, check_folder
+from kornia_tidy.cli.commands.shared import Folder
 from kornia_tidy.design.settings import DesignSettings
+from kornia_tidy.files import output_folder
 from kornia_tidy.settings import Seconds, Seed, Unit, one_of
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ class Design:
 
     def run(self) -> None:
         """Design, and write the files."""
-        folder = check_folder(self.output)
+        folder = output_folder(self.output)
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.data.rgbd_folder import scenes_in
         from kornia_tidy.design.co_design import Effort, planned_work

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from kornia_tidy.cli.commands.parser import Argument, Given
-from kornia_tidy.cli.commands.shared import File, Folder, Noise, check_folder, read_noise
+from kornia_tidy.cli.commands.shared import File, Folder, Noise, read_noise
+from kornia_tidy.files import output_folder
 from kornia_tidy.settings import Count, CountOrNone, Seed
 from kornia_tidy.training.settings import SceneSettings, TrainingSettings
 
@@ -71,7 +72,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate the system, write results and pictures, and print a summary."""
-        folder = check_folder(self.output or Path(self.system).parent / "evaluation")
+        folder = output_folder(self.output or Path(self.system).parent / "evaluation")
         from kornia_tidy.cli.commands.report import progress_bar, tell
         from kornia_tidy.lab.named_system import load_system
         from kornia_tidy.reconstruction.tasks import MAPS

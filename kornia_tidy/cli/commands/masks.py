@@ -238,6 +238,7 @@ def _material(name: str | None) -> Material | None:
 
 def _saved(path: str, name: str | None) -> SavedMasks:
     """Return the masks of a file and their description."""
+    from kornia_tidy.files import error_prefix
     from kornia_tidy.lab.mask_export.mask_files import SavedMasks, masks_in_state, read_heights
     from kornia_tidy.reconstruction.trained import camera_state
 
@@ -246,10 +247,8 @@ def _saved(path: str, name: str | None) -> SavedMasks:
         assert material is not None
         return SavedMasks(read_heights(path), material)
     state = camera_state(path)
-    try:
+    with error_prefix(f"cannot read {path}"):
         return masks_in_state(state, _material(name))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
 
 
 def _check_absent(path: str, force: bool, source: str | None = None, folder: bool = False) -> None:

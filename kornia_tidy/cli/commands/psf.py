@@ -103,7 +103,7 @@ class Psf:
         """Compute the PSFs, print their numbers and draw them."""
         import torch
 
-        from kornia_tidy.cli.commands.report import tell
+        from kornia_tidy.cli.commands.report import tell, tell_camera
         from kornia_tidy.figures.field import airy_radius, draw_field
         from kornia_tidy.figures.field_measures import heights_to_corner, measures_over_field
         from kornia_tidy.figures.psf import draw_psfs
@@ -127,10 +127,7 @@ class Psf:
                 raise ValueError(f"--field is for a camera with a lens, and {self.camera} has none: give it --lens")
             measured = measures_over_field(optics, heights_to_corner(optics.lens, self.field), psi)
             save_figure(self.output, draw_field(measured, airy_radius(optics)), dpi=100)
-        tell("camera", optics.camera.extra_repr())
-        if optics.lens is not None:
-            tell("lens", optics.lens.extra_repr())
-        tell("masks", optics.masks.extra_repr())
+        tell_camera(optics)
         tell("window", f"{optics.window} x {optics.window} px, fidelity {optics.fidelity.name!r}")
         print("", *measured.table(), "", sep="\n")
         tell("wrote", f"{self.output}: look at it")

@@ -103,12 +103,9 @@ class CalibratePsf:
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.lab.calibration.psf.measured_psfs import channel_cutoffs, measure_psfs
         from kornia_tidy.lab.calibration.psf.point_files import images_of_files
-        from kornia_tidy.optics.thin_lens import ThinLensCamera
 
-        lens = LensSettings(**self.lens).camera()
         depths = (0.99 * min(self.distances), 1.01 * max(self.distances))
-        focus = float(lens.focus_distance)
-        camera = ThinLensCamera(lens.focal_length, lens.aperture_diameter, focus, lens.pixel_pitch, depths)
+        camera = LensSettings(**self.lens).camera().changed(depth_range=depths)
         sensor, calibration = self.sensor.noise_of()
         images = images_of_files(
             partial(self._read, calibration=calibration),

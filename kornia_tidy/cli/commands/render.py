@@ -135,7 +135,7 @@ class Render:
 
     def run(self) -> None:
         """Render the data set, and print a summary."""
-        from kornia_tidy.cli.commands.report import progress_bar, tell
+        from kornia_tidy.cli.commands.report import progress_bar, tell, tell_camera
         from kornia_tidy.training.coded_datasets.layout import Layout
         from kornia_tidy.training.coded_datasets.render_scenes import (
             place_among_processes,
@@ -156,8 +156,7 @@ class Render:
         made_from = {**camera_from, "split": self.split, "scenes": {name: values[name] for name in OF_SCENES}}
         who = f", process {rank + 1} of {world}" if world > 1 else ""
         if rank == 0:
-            tell("camera", optics.camera.extra_repr())
-            tell("masks", optics.masks.extra_repr())
+            tell_camera(optics)
             tell("scenes", f"{len(scenes)} of {settings.data!r}, {self.split}")  # ty: ignore[invalid-argument-type]
         start = time.perf_counter()
         with progress_bar(f"render{who}", unit="scene", disable=None if rank == 0 else True) as bar:

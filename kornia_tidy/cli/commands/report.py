@@ -23,6 +23,14 @@ def tell(topic: str, text: str) -> None:
     print(f"{topic:<9} {text}", flush=True)
 
 
+def tell_camera(optics: TiDyOptics, masks: str | None = None) -> None:
+    """Print the lines of a camera, its real lens and its masks, which may be described in words."""
+    tell("camera", optics.camera.extra_repr())
+    if optics.lens is not None:
+        tell("lens", optics.lens.extra_repr())
+    tell("masks", masks or optics.masks.extra_repr())
+
+
 def scene_in_words(scene: Scene) -> str:
     """Return size and depths of a scene."""
     height, width = scene.image.shape[-2:]

@@ -101,6 +101,16 @@ class OwnScene:
         """Read the scene, if there is one."""
         return None if self.image is None or self.depth is None else self.file.read(self.image, self.depth)
 
+    def read_or_paint(self, height: int, width: int, near: float, far: float, seed: int) -> tuple[Scene, str]:
+        """Return the scene and the name of its picture, or dead leaves between two distances."""
+        from kornia_tidy.data.dead_leaves import dead_leaves
+        from kornia_tidy.data.rgbd import Scene
+
+        if (scene := self.read()) is not None:
+            return scene, Path(str(self.image)).name
+        painted = dead_leaves(height, width, depth_range=(near, far), seed=seed)
+        return Scene.whole(*painted), f"dead leaves, seed {seed}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class SensorInElectrons:
@@ -350,11 +360,3 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
         check_writable(path)
         if path.exists() and any(path.samefile(other) for other in there):
             raise ValueError(f"cannot write {path}: it is an input")
-
-
-def check_folder(path: str | Path) -> Path:
-    """Return a folder to write into, or raise ``ValueError`` if something else has its name."""
-    folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
-    return folder

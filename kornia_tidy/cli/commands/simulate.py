@@ -90,23 +90,15 @@ class Simulate:
             "mask_seed",
             "psfs",
         ),
-        *(
-            "focal_length",
-            "f_number",
-            "focus_distance",
-            "depth_range",
-            "pixel_pitch",
-            "fit_depth",
-            "lens",
-            "depth_scale",
-        ),
+        *("focal_length", "f_number", "focus_distance", "depth_range", "pixel_pitch", "fit_depth", "lens"),
+        "depth_scale",
     )
 
     def run(self) -> None:
         """Simulate the capture and write it."""
         import torch
 
-        from kornia_tidy.cli.commands.report import clamped_in_words, light_in_words, scene_in_words, tell
+        from kornia_tidy.cli.commands.report import clamped_in_words, light_in_words, scene_in_words, tell, tell_camera
         from kornia_tidy.data.image_files import write_image
         from kornia_tidy.sensor.sensor import SensorNoise
 
@@ -131,10 +123,7 @@ class Simulate:
                 border=self.border,
             )
             bank = optics.psf_bank(channels=scene.image.shape[0])
-            tell("camera", optics.camera.extra_repr())
-            if optics.lens is not None:
-                tell("lens", optics.lens.extra_repr())
-            tell("masks", self.camera.in_words(optics))
+            tell_camera(optics, self.camera.in_words(optics))
             tell("PSFs", light_in_words(bank, optics))
             tell(
                 "capture", f"{optics.compositing}, {optics.border} border, {optics.color_space} colour, {optics.sensor}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from kornia_tidy.choices import SYSTEMS
@@ -101,18 +100,9 @@ class Systems:
 
     def _scene(self) -> tuple[Tensor, Tensor, str]:
         """Return an RGB image, its normalised inverse depth in [0, 1], and its name."""
-        import torch
-
-        from kornia_tidy.data.dead_leaves import dead_leaves
         from kornia_tidy.data.depth_range import middle_depths
-        from kornia_tidy.data.rgbd import Scene
 
-        if (scene := self.scene.read()) is None:
-            height, width = round(self.size * 0.625), self.size
-            image, depth = dead_leaves(height, width, depth_range=(0.5, 5.0), seed=self.seed)
-            scene, name = Scene(image, depth, torch.ones_like(depth, dtype=torch.bool)), "dead leaves"
-        else:
-            name = Path(str(self.scene.image)).name
+        scene, name = self.scene.read_or_paint(round(self.size * 0.625), self.size, 0.5, 5.0, self.seed)
         near, far = (1 / end for end in middle_depths(scene.depth, scene.valid))
         image, depth, _ = scene.within(self.size)
         return image, ((1 / depth - far) / (near - far)).clamp(0, 1), name

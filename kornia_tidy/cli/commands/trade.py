@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from kornia_tidy.choices import KNOBS, Preset
-from kornia_tidy.cli.commands.shared import CameraSettings, Folder, OwnScene, check_folder
+from kornia_tidy.cli.commands.shared import CameraSettings, Folder, OwnScene
+from kornia_tidy.files import output_folder
 from kornia_tidy.settings import Count, Pixels, Seed, Unit, one_of
-
-if TYPE_CHECKING:
-    from kornia_tidy.data.rgbd import Scene
 
 NEAR, FAR = 0.3, float("inf")  # m: the default camera's range
 
@@ -79,8 +76,8 @@ class Trade:
 
     def run(self) -> None:
         """Measure the sweep, write files after every row, and print the table."""
-        folder = check_folder(self.output)
-        from kornia_tidy.cli.commands.report import progress_bar, scene_in_words, tell
+        folder = output_folder(self.output)
+        from kornia_tidy.cli.commands.report import progress_bar, scene_in_words, tell, tell_camera
         from kornia_tidy.design.tradeoff.conditions import Conditions
         from kornia_tidy.design.tradeoff.costs import checked_device
         from kornia_tidy.design.tradeoff.files import TradeRun, markdown, write_trade
@@ -90,19 +87,15 @@ class Trade:
 
         require_matplotlib()
         device = checked_device(self.device)
-        scene = self._scene()
+        scene, name = self.scene.read_or_paint(self.size, self.size, NEAR, FAR, self.seed)
         optics = self.camera.optics(scene).to(device)
         image, depth = scene.image.to(device), scene.depth.to(device)
         optics.check_scene(image, depth)  # warns once: the measured captures do not warn
-        name = f"dead leaves, seed {self.seed}" if self.scene.image is None else Path(self.scene.image).name
         conditions = Conditions.here_and_now(name, optics, image, self.reference)
         settings = scene_settings(optics, image, depth, self.base, self.knobs or KNOBS)
 
         tell("scene", f"{name}, {scene_in_words(scene)}")
-        tell("camera", optics.camera.extra_repr())
-        if optics.lens is not None:
-            tell("lens", optics.lens.extra_repr())
-        tell("masks", self.camera.in_words(optics))
+        tell_camera(optics, self.camera.in_words(optics))
         tell("machine", f"{conditions.device}, {conditions.threads} threads, PyTorch {conditions.torch}")
         tell("settings", str(len(settings)))
         folder.mkdir(parents=True, exist_ok=True)
@@ -130,14 +123,3 @@ class Trade:
         tell("bold", "no other setting is both faster and closer to the reference")
         tell("wrote", f"{folder / 'trade.png'}: look at this one")
         tell("", str(folder / "trade.json"))
-
-    def _scene(self) -> Scene:
-        import torch
-
-        from kornia_tidy.data.dead_leaves import dead_leaves
-        from kornia_tidy.data.rgbd import Scene
-
-        if (scene := self.scene.read()) is not None:
-            return scene
-        image, depth = dead_leaves(self.size, self.size, depth_range=(NEAR, FAR), seed=self.seed)
-        return Scene(image, depth, torch.ones_like(depth, dtype=torch.bool))

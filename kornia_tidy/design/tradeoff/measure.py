@@ -86,7 +86,10 @@ def scene_settings(
     """
     widest, knobs = largest_window(optics.border, *image.shape[-2:]), tuple(knobs)
     steps = sweep_settings(base, [knob for knob in knobs if knob != PLAN])
-    settings = [step for step in steps if (step.fidelity.window or 1) <= widest]
+    real = optics.lens is not None
+    settings = [
+        s for s in steps if (s.fidelity.window or 1) <= widest and not (real and s.fidelity.propagation == "paper")
+    ]
     return settings + (planned(optics, linear_light(optics, image)[None], depth[None]) if PLAN in knobs else [])
 
 
@@ -264,6 +267,8 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
         border=optics.border,
         spectrum=optics.spectrum,
         aperture=optics.aperture,
+        lens=optics.lens,
+        field_center=optics.field_center,
     )
     # That of a wide defocus disc may be larger than the border allows.
     return camera if camera.window <= widest else camera.with_fidelity(replace(fidelity, window=widest))

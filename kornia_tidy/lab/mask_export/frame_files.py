@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,9 +13,9 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice, check_positive
-from kornia_tidy.data.npy import decode_npy
+from kornia_tidy.data.npy import decode_npy, encode_npy
 from kornia_tidy.data.stored import read_stored
-from kornia_tidy.files import read_bytes, read_json, write_folder
+from kornia_tidy.files import error_prefix, json_lines, read_bytes, read_json, write_folder
 from kornia_tidy.lab.mask_export.placement import PanelPlacement
 from kornia_tidy.lab.mask_export.slm_frames import SLMFrames
 from kornia_tidy.lab.mask_export.timing import FrameTime, frame_times, timing_sheet
@@ -89,7 +87,7 @@ def write_slm_frames(
     for name, grey in zip(names, frames.grey.to(pixel).split(1), strict=True):
         picture = placement.place(grey, frames.background)[0].numpy()
         contents[name] = cv2.imencode(suffix, picture if frames.bits <= 8 else picture.view(np.uint16))[1].tobytes()
-    contents[TIMING] = timing_sheet(times, names).encode()
+    contents[TIMING] = timing_sheet(times, names)
     wraps = bool(frames.turns.any())
     if wraps:
         contents[TURNS] = _encoded_turns(frames.turns)
@@ -116,8 +114,7 @@ def write_slm_frames(
         "largest_error_rad": frames.largest_error(),
         "level_phases_rad": frames.level_phases.tolist(),
     }
-    lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in sidecar.items())
-    contents[SIDECAR] = f"{{\n{lines}\n}}\n".encode()
+    contents[SIDECAR] = json_lines(sidecar)
     write_folder(folder, contents, replace=replace)
 
 
@@ -195,10 +192,8 @@ def _read_turns(path: Path) -> np.ndarray:
         FileNotFoundError: if the file is missing.
         ValueError: if the file is damaged or its values are not int16.
     """
-    try:
+    with error_prefix(f"cannot read {path}"):
         turns = decode_npy(read_bytes(path))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
     if turns.dtype != np.int16:
         raise ValueError(f"cannot read {path}: whole waves must be int16, got {turns.dtype}")
     return turns
@@ -234,15 +229,11 @@ def _read_frame(path: Path, depth: int, levels: int, placement: PanelPlacement, 
     picture = torch.from_numpy(codes[..., 0].astype(np.int16 if depth == 16 else np.uint8))
     if int(picture.max()) >= levels or int(picture.min()) < 0:
         raise ValueError(f"{path} must hold grey levels from 0 to {levels - 1}, found {int(codes.max())}")
-    try:
+    with error_prefix(str(path)):
         return placement.read(picture[None], size).long()
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _encoded_turns(turns: Tensor) -> bytes:
     if int(turns.abs().max()) > np.iinfo(np.int16).max:
         raise ValueError(f"heights must be within 32767 waves, got {int(turns.abs().max())}")
-    data = io.BytesIO()
-    np.lib.format.write_array(data, turns.numpy().astype(np.int16), allow_pickle=False)
-    return data.getvalue()
+    return encode_npy(turns.numpy().astype(np.int16))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -16,8 +15,8 @@ from torch import Tensor, nn
 
 from kornia_tidy.camera.saved_parts import masks_of_state, modulator_of_state
 from kornia_tidy.checks import check_choice
-from kornia_tidy.data.npy import decode_npy
-from kornia_tidy.files import read_bytes, write_bytes
+from kornia_tidy.data.npy import decode_npy, encode_npy
+from kornia_tidy.files import error_prefix, read_bytes, write_bytes
 from kornia_tidy.lab.mask_export.slm_frames import checked_heights
 from kornia_tidy.lab.mask_export.timing import FrameTime, frame_times
 from kornia_tidy.masks.base import metres_to_radians
@@ -166,7 +165,7 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
-    try:
+    with error_prefix(f"cannot read {path}"):
         if path.suffix.lower() != ".npy":
             return masks_in_state(read_tensors(path)[0], material).heights
         array = decode_npy(read_bytes(path))
@@ -174,9 +173,6 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
             raise ValueError(f"heights are floats in 2 or 3 axes, not {array.dtype} {array.shape}")
         heights = torch.from_numpy(array.astype(np.float64))
         return checked_heights(heights[None] if heights.ndim == 2 else heights)
-    except ValueError as error:
-        told = str(error)
-        raise ValueError(told if told.startswith("cannot read") else f"cannot read {path}: {told}") from None
 
 
 def write_heights(path: str | os.PathLike[str], heights: Tensor, material: Material | None = None) -> None:
@@ -196,9 +192,7 @@ def write_heights(path: str | os.PathLike[str], heights: Tensor, material: Mater
     path, heights = Path(path), checked_heights(heights)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
     if path.suffix.lower() == ".npy":
-        data = io.BytesIO()
-        np.lib.format.write_array(data, heights.numpy(), allow_pickle=False)
-        write_bytes(path, data.getvalue())
+        write_bytes(path, encode_npy(heights.numpy()))
         return
     phase = heights * metres_to_radians(constant_index(1.5) if material is None else material)
     write_bytes(path, save({"masks.phase": phase.float().contiguous()}))

@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Sequence
 
-from kornia_tidy.files import read_text
+from kornia_tidy.files import error_prefix, read_text
 from kornia_tidy.modulator.phase_panel import check_response
 
 LONGEST = 1000  # characters of a line of the header that count
@@ -77,10 +77,8 @@ def read_response(path: str | os.PathLike[str], bits: int) -> list[float]:
     if width == 2:
         rows = _in_order(path, rows, 2**bits)
     phases = [RADIANS[unit] * numbers[-1] for _, numbers in rows]
-    try:
+    with error_prefix(f"cannot read {path}"):
         check_response(phases, bits, [line for line, _ in rows])
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
     if (span := max(phases) - min(phases)) < SHORT and bits > 1:
         warnings.warn(
             f"the response in {path} spans {span:.3g} rad, read as {unit}: if its phases are in another unit, name "

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 
+from kornia_tidy.files import csv_bytes
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.modulator.switching import Switching
 
@@ -63,23 +62,21 @@ def frame_times(
     return lines
 
 
-def timing_sheet(lines: Sequence[FrameTime], files: Sequence[str]) -> str:
-    """Return a timing sheet as CSV text, with times in milliseconds rounded to nanoseconds.
+def timing_sheet(lines: Sequence[FrameTime], files: Sequence[str]) -> bytes:
+    """Return a timing sheet as CSV, with times in milliseconds rounded to nanoseconds.
 
     Args:
         lines: result of :func:`frame_times`.
         files: file name of each frame.
 
     Example:
-        >>> print(timing_sheet(frame_times((1,), 0.1), ["frame_000.png"]))
+        >>> print(timing_sheet(frame_times((1,), 0.1), ["frame_000.png"]).decode())
         frame,file,start_ms,dwell_ms,weight,swap_ms
         0,frame_000.png,0.000000,100.000000,1.000000000,0.000000
         <BLANKLINE>
     """
-    text = io.StringIO()
-    sheet = csv.writer(text, lineterminator="\n")
-    sheet.writerow(("frame", "file", "start_ms", "dwell_ms", "weight", "swap_ms"))
+    rows: list[tuple[object, ...]] = [("frame", "file", "start_ms", "dwell_ms", "weight", "swap_ms")]
     for line, file in zip(lines, files, strict=True):
-        times = (f"{1e3 * seconds:.6f}" for seconds in (line.start, line.dwell))
-        sheet.writerow((line.frame, file, *times, f"{line.weight:.9f}", f"{1e3 * line.swap:.6f}"))
-    return text.getvalue()
+        start, dwell, swap = (f"{1e3 * seconds:.6f}" for seconds in (line.start, line.dwell, line.swap))
+        rows.append((line.frame, file, start, dwell, f"{line.weight:.9f}", swap))
+    return csv_bytes(rows)

@@ -17,21 +17,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from . import tags
 from .dng_sensor import LINEAR_RAW, LOSSY_JPEG, MAP_POLYNOMIAL, Sensor, opcodes
-from .tags import (
-    BITS,
-    COMPRESSION,
-    LINEARIZATION,
-    OPCODE_LISTS,
-    PHOTOMETRIC,
-    PLANAR,
-    PREDICTOR,
-    ROWS_PER_STRIP,
-    SAMPLE_FORMAT,
-    STRIPS,
-    TILE_SIZE,
-    TILES,
-)
 
 NO_COMPRESSION, JPEG = 1, 7
 # Kind of difference and number of pixels between the two samples, by the value of Predictor.
@@ -50,18 +37,18 @@ def decoded_by_libraw(data: bytes, sensor: Sensor) -> bool:
         ValueError: if they are compressed in a way that neither LibRaw nor this module decodes.
     """
     directory = sensor.directory
-    tiled = TILES[0] in directory.entries
+    tiled = tags.TILES[0] in directory.entries
     if sensor.compression in {JPEG, LOSSY_JPEG}:
         name = "lossy JPEG" if sensor.compression == LOSSY_JPEG else "JPEG"
         if sensor.floating or sensor.separate:
             kind = "floating-point samples" if sensor.floating else "separate planes (PlanarConfiguration 2)"
             raise ValueError(f"its {kind} compressed by {name} cannot be decoded")
-        strips = directory.long_values(data, STRIPS[0])
+        strips = directory.long_values(data, tags.STRIPS[0])
         if not tiled and len(strips) > 1:
             raise ValueError(
                 f"its {len(strips)} strips compressed by {name} cannot be decoded, only tiles or one strip"
             )
-        wide = _first(sensor, TILE_SIZE[0])
+        wide = _first(sensor, tags.TILE_SIZE[0])
         if sensor.compression == LOSSY_JPEG:
             _check_lossy(data, sensor)
         elif tiled and wide > sensor.width:
@@ -102,9 +89,9 @@ def read_samples(data: bytes, sensor: Sensor) -> np.ndarray:
         values = _values(block, sensor, columns * together, kind, step * together)
         there = picture[top : top + rows, left : left + columns, plane * together : (plane + 1) * together]
         there[:] = values.reshape(rows, columns, together)[: there.shape[0], : there.shape[1]]
-    if LINEARIZATION not in directory.entries:
+    if tags.LINEARIZATION not in directory.entries:
         return picture
-    values = directory.long_values(data, LINEARIZATION)
+    values = directory.long_values(data, tags.LINEARIZATION)
     if sensor.floating or not values or not all(type(value) is int and 0 <= value <= HIGHEST for value in values):
         raise ValueError(f"its LinearizationTable of {len(values)} values is not one of 16 bits for integer samples")
     return np.array(values, np.uint16)[np.minimum(picture, len(values) - 1)]
@@ -117,10 +104,16 @@ def plain_version(data: bytes, sensor: Sensor) -> bytearray:
     """
     plain, order = bytearray(data), sensor.directory.order
     plain += bytes(max(12, ANYWHERE + 2 * sensor.samples * sensor.width * sensor.height - len(plain)))
-    strips = dict.fromkeys((STRIPS[0], TILES[0]), (STRIPS[0], 4, ANYWHERE))
-    one = {COMPRESSION: (COMPRESSION, 3, 1), PLANAR: (PLANAR, 3, 1), SAMPLE_FORMAT: (SAMPLE_FORMAT, 3, 1)}
-    unused = dict.fromkeys((PREDICTOR, LINEARIZATION, *TILE_SIZE, STRIPS[1], TILES[1]), (UNUSED_TAG, 3, 1))
-    for tag, (new, kind, value) in {**strips, **one, **unused, BITS: (BITS, 3, 16)}.items():
+    strips = dict.fromkeys((tags.STRIPS[0], tags.TILES[0]), (tags.STRIPS[0], 4, ANYWHERE))
+    one = {
+        tags.COMPRESSION: (tags.COMPRESSION, 3, 1),
+        tags.PLANAR: (tags.PLANAR, 3, 1),
+        tags.SAMPLE_FORMAT: (tags.SAMPLE_FORMAT, 3, 1),
+    }
+    unused = dict.fromkeys(
+        (tags.PREDICTOR, tags.LINEARIZATION, *tags.TILE_SIZE, tags.STRIPS[1], tags.TILES[1]), (UNUSED_TAG, 3, 1)
+    )
+    for tag, (new, kind, value) in {**strips, **one, **unused, tags.BITS: (tags.BITS, 3, 16)}.items():
         if tag in sensor.directory.entries:
             layout = "HHIHxx" if kind == 3 else "HHII"
             struct.pack_into(order + layout, plain, sensor.directory.entries[tag], new, kind, 1, value)
@@ -132,16 +125,16 @@ def _check_lossy(data: bytes, sensor: Sensor) -> None:
 
     LibRaw applies the polynomial of each of three planes to the samples over 255, and nothing else.
     """
-    found = [text for code, _, text in opcodes(data, sensor.directory, OPCODE_LISTS[1]) if code == MAP_POLYNOMIAL]
+    found = [text for code, _, text in opcodes(data, sensor.directory, tags.OPCODE_LISTS[1]) if code == MAP_POLYNOMIAL]
     # area and planes: top, left, bottom, right, first plane, planes, row pitch, column pitch; then the degree
     shapes = [struct.unpack_from(">9I", text) for text in found if len(text) >= 36]
     known = (
-        sensor.directory.whole_numbers(PHOTOMETRIC)[:1] == (LINEAR_RAW,)
+        sensor.directory.whole_numbers(tags.PHOTOMETRIC)[:1] == (LINEAR_RAW,)
         and (sensor.samples, sensor.bits, sensor.area[:2]) == (3, 8, (0, 0))
         and set(sensor.white) == {255}
         and not any(level for row in sensor.black for pixel in row for level in pixel)
         and not any((*sensor.black_columns, *sensor.black_rows))
-        and LINEARIZATION not in sensor.directory.entries
+        and tags.LINEARIZATION not in sensor.directory.entries
         and sorted(shape[4:8] for shape in shapes) == [(plane, 1, 1, 1) for plane in range(3)]
         and all(shape[8] <= HIGHEST_DEGREE for shape in shapes)
     )
@@ -155,15 +148,15 @@ def _check_lossy(data: bytes, sensor: Sensor) -> None:
 def _blocks(data: bytes, sensor: Sensor) -> Iterator[tuple[int, int, tuple[int, int, int, int, int]]]:
     """Yield the strips or tiles: offset and length in the file; rows, columns, plane, top and left."""
     directory = sensor.directory
-    tiled, kept = TILES[0] in directory.entries, sensor.samples if sensor.separate else 1
+    tiled, kept = tags.TILES[0] in directory.entries, sensor.samples if sensor.separate else 1
     if tiled:
-        columns, rows = (_first(sensor, tag) for tag in TILE_SIZE)
+        columns, rows = (_first(sensor, tag) for tag in tags.TILE_SIZE)
         if min(rows, columns) < 1:
             raise ValueError(f"its tiles have {columns} x {rows} pixels (TileWidth and TileLength)")
     else:
-        rows = _first(sensor, ROWS_PER_STRIP) or sensor.height
+        rows = _first(sensor, tags.ROWS_PER_STRIP) or sensor.height
         rows, columns = min(rows, sensor.height), sensor.width
-    offsets, lengths = (directory.long_values(data, tag) for tag in (TILES if tiled else STRIPS))
+    offsets, lengths = (directory.long_values(data, tag) for tag in (tags.TILES if tiled else tags.STRIPS))
     if sensor.compression == NO_COMPRESSION:
         lengths = lengths or (0,) * len(offsets)  # not needed
     needed = kept * -(-sensor.height // rows) * -(-sensor.width // columns)
@@ -187,7 +180,7 @@ def _row_bytes(sensor: Sensor, columns: int) -> int:
 
 def _predictor(sensor: Sensor) -> tuple[str, int]:
     """Return the kind of differences that are stored, and the number of pixels between the two samples."""
-    code = _first(sensor, PREDICTOR)
+    code = _first(sensor, tags.PREDICTOR)
     if code in {0, 1}:
         return "", 1
     kind, step = PREDICTORS.get(code, ("", 1))

@@ -14,33 +14,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .tags import (
-    ACTIVE_AREA,
-    BITS,
-    BLACK_COLUMNS,
-    BLACK_LEVEL,
-    BLACK_REPEAT,
-    BLACK_ROWS,
-    COMPRESSION,
-    DNG_VERSION,
-    FILTER_COLORS,
-    FILTER_LAYOUT,
-    FILTER_PATTERN,
-    FILTER_REPEAT,
-    HEIGHT,
-    NEUTRAL,
-    OPCODE_LISTS,
-    PHOTOMETRIC,
-    PLANAR,
-    SAMPLE_FORMAT,
-    SAMPLES,
-    STRIPS,
-    SUBFILE_TYPE,
-    TILES,
-    WHITE_LEVEL,
-    WIDTH,
-    Directory,
-)
+from . import tags
+from .tags import Directory
 
 FILTER_ARRAY, LINEAR_RAW = 32803, 34892  # values of PhotometricInterpretation
 COLOR_LETTERS = "RGBCMYW"  # a letter's place is its code in CFAPattern and CFAPlaneColor
@@ -112,29 +87,29 @@ def dng_sensor(data: bytes, directories: list[Directory]) -> Sensor | None:
         >>> dng_sensor(b"no DNG", []) is None
         True
     """
-    if not any(DNG_VERSION in directory for directory in directories):
+    if not any(tags.DNG_VERSION in directory for directory in directories):
         return None
     for directory in directories:  # LibRaw takes the pattern from any of them, and reads beyond its tables
-        if FILTER_PATTERN in directory or _one(directory, PHOTOMETRIC) == FILTER_ARRAY:
+        if tags.FILTER_PATTERN in directory or _one(directory, tags.PHOTOMETRIC) == FILTER_ARRAY:
             _filter_array(directory)
-    main = [d for d in directories if d.get(WIDTH) and not any(d.whole_numbers(SUBFILE_TYPE)[:1])]
-    main = [d for d in main if _one(d, PHOTOMETRIC) in {FILTER_ARRAY, LINEAR_RAW}]  # LibRaw decodes the first
+    main = [d for d in directories if d.get(tags.WIDTH) and not any(d.whole_numbers(tags.SUBFILE_TYPE)[:1])]
+    main = [d for d in main if _one(d, tags.PHOTOMETRIC) in {FILTER_ARRAY, LINEAR_RAW}]  # LibRaw decodes the first
     if not main:
         return None
-    found, samples = main[0], _one(main[0], SAMPLES, 1)
-    width, height = _one(found, WIDTH), _one(found, HEIGHT)
+    found, samples = main[0], _one(main[0], tags.SAMPLES, 1)
+    width, height = _one(found, tags.WIDTH), _one(found, tags.HEIGHT)
     if not (SIDES[0] <= min(width, height) and max(width, height) <= SIDES[1]):
         raise ValueError(f"its picture has {width} x {height} pixels, and {SIDES[0]} to {SIDES[1]} can be decoded")
     bits, floating, compression = _sample_kind(found)
     tile, planes = (None, "")
-    if _one(found, PHOTOMETRIC) == FILTER_ARRAY:
+    if _one(found, tags.PHOTOMETRIC) == FILTER_ARRAY:
         if samples != 1:
             raise ValueError(f"its picture behind a filter array has {samples} samples a pixel, not 1")
         tile, planes = _square_tile(*_filter_array(found))
     elif samples != 1:
         planes = _plane_names(found, samples)
     black, columns, rows = _black(data, found, directories[0], samples)
-    area = found.whole_numbers(ACTIVE_AREA) if ACTIVE_AREA in found else (0, 0, height, width)
+    area = found.whole_numbers(tags.ACTIVE_AREA) if tags.ACTIVE_AREA in found else (0, 0, height, width)
     if len(area) != 4 or not (0 <= area[0] < area[2] <= height and 0 <= area[1] < area[3] <= width):
         raise ValueError(f"its ActiveArea {_listed(area)} does not lie within its {width} x {height} pixels")
     if min(area[2] - area[0], area[3] - area[1]) < SIDES[0]:
@@ -145,9 +120,9 @@ def dng_sensor(data: bytes, directories: list[Directory]) -> Sensor | None:
     ):
         if len(levels) not in {0, length}:
             raise ValueError(f"its {name} has {len(levels)} values for an active area of {length}")
-    white = _white(found if WHITE_LEVEL in found else directories[0], samples, 1 if floating else 2**bits - 1)
-    separate = samples > 1 and _one(found, PLANAR, 1) == 2
-    neutral = found.get(NEUTRAL) or directories[0].get(NEUTRAL) or ()
+    white = _white(found if tags.WHITE_LEVEL in found else directories[0], samples, 1 if floating else 2**bits - 1)
+    separate = samples > 1 and _one(found, tags.PLANAR, 1) == 2
+    neutral = found.get(tags.NEUTRAL) or directories[0].get(tags.NEUTRAL) or ()
     neutral = neutral if all(isinstance(value, int | float) and 0 < value < math.inf for value in neutral) else ()
     return Sensor(
         found, width, height, samples, bits, floating, compression, separate, planes, tile, area, black, columns,
@@ -157,13 +132,13 @@ def dng_sensor(data: bytes, directories: list[Directory]) -> Sensor | None:
 
 def missing_bytes(data: bytes, directories: list[Directory]) -> int:
     """Return the number of bytes of a DNG's picture beyond the end of the file; LibRaw leaves lost tiles empty."""
-    if not directories or DNG_VERSION not in directories[0]:
+    if not directories or tags.DNG_VERSION not in directories[0]:
         return 0
-    whole = [directory for directory in directories if not any(directory.whole_numbers(SUBFILE_TYPE)[:1])]
+    whole = [directory for directory in directories if not any(directory.whole_numbers(tags.SUBFILE_TYPE)[:1])]
     ends = [
         offset + length
         for directory in whole
-        for extents in (STRIPS, TILES)
+        for extents in (tags.STRIPS, tags.TILES)
         for offset, length in zip(*map(directory.whole_numbers, extents), strict=False)
     ]
     return max(0, max(ends, default=0) - len(data))
@@ -176,9 +151,9 @@ def ignored_opcodes(data: bytes, sensor: Sensor) -> list[str]:
     """
     return [
         (OPCODES[code - 1] if 0 < code <= len(OPCODES) else f"opcode {code}") + (" (optional)" if optional else "")
-        for tag in OPCODE_LISTS
+        for tag in tags.OPCODE_LISTS
         for code, optional, _ in opcodes(data, sensor.directory, tag)
-        if (sensor.compression, tag, code) != (LOSSY_JPEG, OPCODE_LISTS[1], MAP_POLYNOMIAL)
+        if (sensor.compression, tag, code) != (LOSSY_JPEG, tags.OPCODE_LISTS[1], MAP_POLYNOMIAL)
     ]
 
 
@@ -215,8 +190,8 @@ def shifted(tile: Sequence[str], down: int, right: int) -> list[str]:
 
 def _sample_kind(directory: Directory) -> tuple[int, bool, int]:
     """Return the bits of a sample, whether samples are floating-point numbers, and the compression."""
-    bits, kinds = directory.whole_numbers(BITS) or (0,), directory.whole_numbers(SAMPLE_FORMAT) or (UNSIGNED,)
-    compression = _one(directory, COMPRESSION) or 1  # 0 is written for none
+    bits, kinds = directory.whole_numbers(tags.BITS) or (0,), directory.whole_numbers(tags.SAMPLE_FORMAT) or (UNSIGNED,)
+    compression = _one(directory, tags.COMPRESSION) or 1  # 0 is written for none
     if compression not in DECODED:
         name = f"{COMPRESSIONS[compression]} (Compression {compression})" if compression in COMPRESSIONS else None
         raise ValueError(
@@ -237,9 +212,9 @@ def _black(
     data: bytes, directory: Directory, first: Directory, samples: int
 ) -> tuple[list[list[tuple[float, ...]]], tuple[float, ...], tuple[float, ...]]:
     """Return the repeating black levels, and what columns and rows add to them."""
-    source = directory if BLACK_LEVEL in directory else first
-    size = source.whole_numbers(BLACK_REPEAT) if BLACK_REPEAT in source else (1, 1)
-    levels = source.get(BLACK_LEVEL, (0,))
+    source = directory if tags.BLACK_LEVEL in directory else first
+    size = source.whole_numbers(tags.BLACK_REPEAT) if tags.BLACK_REPEAT in source else (1, 1)
+    levels = source.get(tags.BLACK_LEVEL, (0,))
     if len(size) != 2 or min(size) < 1:
         raise ValueError(f"its BlackLevelRepeatDim is {_listed(size)}, not two numbers from 1")
     rows, columns = size
@@ -250,7 +225,7 @@ def _black(
         raise ValueError(
             f"its BlackLevel has {len(levels)} values, its BlackLevelRepeatDim says {rows} x {columns}{of}"
         )
-    deltas = source.long_values(data, BLACK_COLUMNS), source.long_values(data, BLACK_ROWS)
+    deltas = source.long_values(data, tags.BLACK_COLUMNS), source.long_values(data, tags.BLACK_ROWS)
     for name, values in zip(("BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"), (levels, *deltas), strict=True):
         if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
             raise ValueError(f"its {name} holds a value that is not a finite number")
@@ -260,7 +235,7 @@ def _black(
 
 def _white(directory: Directory, samples: int, default: float) -> tuple[float, ...]:
     """Return the white level of each sample; 0 and none mean the default."""
-    levels = directory.get(WHITE_LEVEL, (default,))
+    levels = directory.get(tags.WHITE_LEVEL, (default,))
     if len(set(levels)) == 1:
         levels = levels[:1] * samples
     if len(levels) != samples:
@@ -279,10 +254,10 @@ def _filter_array(directory: Directory) -> tuple[list[str], str]:
     Raises:
         ValueError: if its tags contradict each other.
     """
-    pattern = directory.codes(FILTER_PATTERN)
+    pattern = directory.codes(tags.FILTER_PATTERN)
     if not pattern:
         raise ValueError("its CFAPattern is missing or cannot be read")
-    size = directory.whole_numbers(FILTER_REPEAT)
+    size = directory.whole_numbers(tags.FILTER_REPEAT)
     rows, columns = size if len(size) == 2 else (0, 0)
     if not (0 < rows <= LARGEST_FILTER_TILE and 0 < columns <= LARGEST_FILTER_TILE):
         raise ValueError(f"its CFARepeatPatternDim is {_listed(size)}, not two numbers from 1 to {LARGEST_FILTER_TILE}")
@@ -291,7 +266,7 @@ def _filter_array(directory: Directory) -> tuple[list[str], str]:
     colors = _plane_codes(directory)
     if beyond := sorted(set(pattern) - set(colors)):
         raise ValueError(f"its CFAPattern holds {_listed(beyond)}, which is not among its colours {_listed(colors)}")
-    layout = directory.whole_numbers(FILTER_LAYOUT) if FILTER_LAYOUT in directory else (1,)
+    layout = directory.whole_numbers(tags.FILTER_LAYOUT) if tags.FILTER_LAYOUT in directory else (1,)
     if layout != (1,):
         raise ValueError(f"its CFALayout is {_listed(layout)}, and only 1, pixels in rows and columns, can be decoded")
     letters = _letters(pattern)
@@ -299,7 +274,7 @@ def _filter_array(directory: Directory) -> tuple[list[str], str]:
 
 
 def _plane_codes(directory: Directory) -> tuple[int, ...]:
-    colors = directory.codes(FILTER_COLORS) if FILTER_COLORS in directory else (0, 1, 2)
+    colors = directory.codes(tags.FILTER_COLORS) if tags.FILTER_COLORS in directory else (0, 1, 2)
     if not 0 < len(colors) == len(set(colors) & set(range(len(COLOR_LETTERS)))):
         last = len(COLOR_LETTERS) - 1
         raise ValueError(f"its CFAPlaneColor is {_listed(colors)}, not different colours from 0 to {last}")

@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator, Sequence
 
 from kornia_tidy.optics.lens.file_surfaces import AIR, FAR, FileLens, FileSurface, number
-from kornia_tidy.optics.lens.glasses import catalogue_glass
 
 UNITS = {"M": 1.0, "MM": 1.0, "C": 10.0, "CM": 10.0, "I": 25.4, "IN": 25.4}
 _POWERS = dict(zip("ABCDEFGHJ", range(4, 22, 2), strict=True))  # of an asphere's coefficients; the letter I is left out
@@ -61,13 +60,7 @@ class _Reader:
             self._command(words[0], words[1:])
         if not self.ended or len(self.surfaces) < 3:
             raise ValueError("it must have an object (SO), surfaces (S) and a sensor (SI)")
-        first, sensor = self.surfaces[0], self.surfaces[-1]
-        if first.glass != AIR:
-            raise ValueError(f"the lens must stand in air, got {first.glass!r:.60} in front of it")
-        if not sensor.plane:
-            raise ValueError("its sensor (SI) must be a plane, got a curved one")
-        lens.distance = math.inf if abs(first.gap) >= FAR else first.gap
-        lens.surfaces = self.surfaces[1:-1]
+        lens.take(self.surfaces)
         if self.stop is not None:
             if not 1 <= self.stop <= len(lens.surfaces):
                 raise ValueError(f"its stop must be one of the surfaces 1 to {len(lens.surfaces)}, got {self.stop}")
@@ -141,16 +134,10 @@ class _Reader:
         if label == "REFL":
             raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
         indices = self.lens.indices
-        if label not in indices:
-            if _FICTITIOUS.fullmatch(label):
-                index, abbe = label.split(".")
-                indices[label] = {"nd": 1 + int(index) / 10 ** len(index), "vd": int(abbe) / 10 ** (len(abbe) - 2)}
-            else:
-                try:
-                    indices[label] = catalogue_glass(label)
-                except ValueError as error:
-                    raise ValueError(f"{where}: {error}") from None
-        return label
+        if label not in indices and _FICTITIOUS.fullmatch(label):
+            index, abbe = label.split(".")
+            indices[label] = {"nd": 1 + int(index) / 10 ** len(index), "vd": int(abbe) / 10 ** (len(abbe) - 2)}
+        return self.lens.glass(where, label)
 
     def _of_surface(self, surface: FileSurface, command: str, words: Sequence[str]) -> None:
         if command == "STO":

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from kornia_tidy.files import error_prefix
 from kornia_tidy.optics.lens.first_order import first_order
+from kornia_tidy.optics.lens.glasses import catalogue_glass
 from kornia_tidy.optics.lens.prescription import Prescription
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 
@@ -71,6 +73,28 @@ class FileLens:
     wavelength: float = REFERENCE_WAVELENGTH
     height: float | None = None
     angle: float | None = None
+
+    def take(self, rows: Sequence[FileSurface]) -> None:
+        """Take the surfaces of a file, from the object to the sensor.
+
+        Raises:
+            ValueError: if they are fewer than three, or the object's medium or the sensor's shape is another.
+        """
+        if len(rows) < 3:
+            raise ValueError(f"it must have an object, surfaces and a sensor, got {len(rows)} of them")
+        first, *self.surfaces, sensor = rows
+        if first.glass != AIR:
+            raise ValueError(f"the lens must stand in air, got {first.glass!r:.60} in front of it")
+        if not sensor.plane:
+            raise ValueError("its last surface is the sensor and must be a plane, got a curved one")
+        self.distance = math.inf if abs(first.gap) >= FAR else first.gap
+
+    def glass(self, where: str, name: str, makers: Sequence[str] = ()) -> str:
+        """Return the name of a glass, whose index is that of the file or of the catalogues of some makers."""
+        if name not in self.indices:
+            with error_prefix(f"{where}"):
+                self.indices[name] = catalogue_glass(name, makers)
+        return name
 
 
 def lens_of(lens: FileLens) -> tuple[Prescription, float | None]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.files import read_text
+from kornia_tidy.files import error_prefix, read_text
 from kornia_tidy.optics.lens.field_table import mirrored_nodes
 from kornia_tidy.optics.lens.lens_table import LensTable, count_of, osa_indices
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -120,10 +120,8 @@ def read_zernike_table(
     check_choice("order", order, ORDERS)
     check_choice("sign", sign, (-1, 1))
     reader = csv.reader(read_text(path).splitlines())
-    try:
+    with error_prefix(f"cannot read {path}", csv.Error):
         rows = [(reader.line_num, row) for row in reader if row and not row[0].startswith("#")]
-    except csv.Error as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
     if not 2 <= len(rows) <= _MOST_ROWS:
         raise ValueError(
             f"{path} must have a line of names and one or more of numbers, got {len(rows)} lines of 2 to {_MOST_ROWS}"

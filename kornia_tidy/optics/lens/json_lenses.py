@@ -9,7 +9,6 @@ from typing import Any
 
 from kornia_tidy.checks import described
 from kornia_tidy.optics.lens.file_surfaces import AIR, FileLens, FileSurface, number
-from kornia_tidy.optics.lens.glasses import catalogue_glass
 
 _OPTILAND_SHAPES = {"Plane": 0, "StandardGeometry": 0, "EvenAsphere": 2, "OddAsphere": 1}  # step of the powers
 _DEEPLENS_STOPS, _DEEPLENS_SHAPES = ("Stop", "Aperture"), ("Spheric", "Aspheric", "Plane")
@@ -43,23 +42,17 @@ def read_json_lens(value: Any) -> FileLens | None:
 
 def _optiland(value: Mapping[str, Any]) -> FileLens:
     rows = _part("surface_group", value["surface_group"], "surfaces", list)
-    if len(rows) < 3:
-        raise ValueError(f"it must have an object, surfaces and a sensor, got {len(rows)} of them")
     lens = FileLens(str(value.get("name") or ""))
     lens.wavelength, (lens.height, lens.angle) = _optiland_wavelength(value), _optiland_field(value)
-    surfaces = [_optiland_surface(i, row, lens.indices) for i, row in enumerate(rows)]
+    surfaces = [_optiland_surface(i, row, lens) for i, row in enumerate(rows)]
     places = [_place(i, row) for i, row in enumerate(rows)]
     for i, surface in enumerate(surfaces[:-1]):
         surface.gap = places[i + 1] - places[i]
-    if surfaces[0].glass != AIR:
-        raise ValueError(f"the lens must stand in air, got {surfaces[0].glass!r:.60} in front of it")
-    if not surfaces[-1].plane:
-        raise ValueError("its last surface is the sensor and must be a plane, got a curved one")
-    lens.distance, lens.surfaces = surfaces[0].gap, surfaces[1:-1]
+    lens.take(surfaces)
     return lens
 
 
-def _optiland_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
+def _optiland_surface(i: int, row: Any, lens: FileLens) -> FileSurface:
     where = f"surface {i}"
     shape = _part(where, row, "geometry", Mapping)
     kind = shape.get("type")
@@ -84,23 +77,23 @@ def _optiland_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
         if not isinstance(edge, Mapping) or edge.get("type") != "RadialAperture" or edge.get("r_min"):
             raise ValueError(f"the aperture of {where} must be a disc about the axis, got {edge!r:.60}")
         surface.clear = number(f"r_max of {where}", edge.get("r_max"))
-    surface.glass = _optiland_glass(where, _part(where, row, "material_post", Mapping), indices)
+    surface.glass = _optiland_glass(where, _part(where, row, "material_post", Mapping), lens)
     return surface
 
 
-def _optiland_glass(where: str, given: Mapping[str, Any], indices: dict[str, Any]) -> str:
+def _optiland_glass(where: str, given: Mapping[str, Any], lens: FileLens) -> str:
     kind = given.get("type")
     if kind == "IdealMaterial":
         index = number(f"index of {where}", given.get("index"))
         if index == 1:
             return AIR
-        return _added(indices, f"{index:g}", index)
+        return _added(lens, f"{index:g}", index)
     if kind == "AbbeMaterial":
         nd, vd = (number(f"{name} of {where}", given.get(name)) for name in ("index", "abbe"))
-        return _added(indices, f"{nd:g}/{vd:g}", {"nd": nd, "vd": vd})
+        return _added(lens, f"{nd:g}/{vd:g}", {"nd": nd, "vd": vd})
     if kind == "Material" and isinstance(given.get("name"), str):
         maker = given.get("reference") or given.get("catalog")
-        return _named(where, given["name"], indices, [maker] if isinstance(maker, str) else ())
+        return lens.glass(where, given["name"], [maker] if isinstance(maker, str) else ())
     if kind == "Mirror":
         raise ValueError(f"{where} is a mirror, and only lenses of refracting surfaces are read")
     raise ValueError(f"the glass of {where} must be Material, AbbeMaterial or IdealMaterial, got {kind!r:.60}")
@@ -146,13 +139,13 @@ def _deeplens(value: Mapping[str, Any], rows: Sequence[Any]) -> FileLens:
     lens = FileLens(str(value.get("info") or ""))
     if value.get("r_sensor") is not None:
         lens.height = number("r_sensor", value["r_sensor"])
-    lens.surfaces = [_deeplens_surface(i, row, lens.indices) for i, row in enumerate(rows)]
+    lens.surfaces = [_deeplens_surface(i, row, lens) for i, row in enumerate(rows)]
     if lens.surfaces[-1].gap == 0:
         raise ValueError(f"d_next of {lens.surfaces[-1].where} must be the distance to the sensor, got 0")
     return lens
 
 
-def _deeplens_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
+def _deeplens_surface(i: int, row: Any, lens: FileLens) -> FileSurface:
     where = f"surface {i}"
     if not isinstance(row, Mapping):
         raise TypeError(f"{where} must be a mapping, got {described(row)}")
@@ -161,7 +154,7 @@ def _deeplens_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
         allowed = ", ".join((*_DEEPLENS_STOPS, *_DEEPLENS_SHAPES))
         raise ValueError(f"type of {where} must be one of {allowed}, got {kind!r:.60}")
     surface = FileSurface(where, gap=number(f"d_next of {where}", row.get("d_next")))
-    surface.glass = _deeplens_glass(where, row.get("mat2"), indices)
+    surface.glass = _deeplens_glass(where, row.get("mat2"), lens)
     if kind in _DEEPLENS_STOPS:
         surface.stop = True
         return surface
@@ -185,14 +178,14 @@ def _deeplens_surface(i: int, row: Any, indices: dict[str, Any]) -> FileSurface:
     return surface
 
 
-def _deeplens_glass(where: str, name: Any, indices: dict[str, Any]) -> str:
+def _deeplens_glass(where: str, name: Any, lens: FileLens) -> str:
     if not isinstance(name, str):
         raise TypeError(f"mat2 of {where} must be a name, got {described(name)}")
     if name.lower() in _EMPTY:
         return AIR
     if pair := re.fullmatch(r"(\d\.\d+)/(\d+\.?\d*)", name):
-        return _added(indices, name, {"nd": float(pair[1]), "vd": float(pair[2])})
-    return _named(where, name, indices, ())
+        return _added(lens, name, {"nd": float(pair[1]), "vd": float(pair[2])})
+    return lens.glass(where, name)
 
 
 # ---------------------------------------------------------------------------------------------------- both
@@ -213,15 +206,6 @@ def _inverse(what: str, value: Any) -> float:
     return 1 / radius if radius else 0.0
 
 
-def _added(indices: dict[str, Any], label: str, index: Any) -> str:
-    indices[label] = index
+def _added(lens: FileLens, label: str, index: Any) -> str:
+    lens.indices[label] = index
     return label
-
-
-def _named(where: str, name: str, indices: dict[str, Any], makers: Sequence[str]) -> str:
-    if name not in indices:
-        try:
-            indices[name] = catalogue_glass(name, makers)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-    return name

@@ -456,15 +456,7 @@ class Lens(nn.Module):
         return cls(*lens_parts(*read_tensors(path, "lens"), str(path)))
 
     def _parts(self) -> LensParts:
-        return LensParts(
-            self.name,
-            self.source,
-            self.focal_length,
-            self.f_number,
-            self.focus_distance,
-            self._table,
-            self._residual,
-        )
+        return LensParts(*(getattr(self, name) for name in LensParts._fields))
 
     @on_cpu
     def get_extra_state(self) -> Tensor:

@@ -10,7 +10,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from kornia_tidy.checks import check_finite, check_number, check_positive, described
-from kornia_tidy.files import parse_json
+from kornia_tidy.files import error_prefix, parse_json
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens_table import EXACT, LensTable
 from kornia_tidy.optics.lens.made_lenses import LensParts
@@ -49,7 +49,7 @@ def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: st
         if not value.is_floating_point():
             raise ValueError(f"cannot read {path}: {name} must be floating point, got {value.dtype}")
         check_finite(f"{name} of {path}", value if name != "scalars" else value[:2])
-    try:
+    with error_prefix(f"cannot read {path}"):
         scalars = tensors["scalars"]
         if tuple(scalars.shape) != (len(_SCALARS),):
             raise ValueError(f"scalars must have shape ({len(_SCALARS)},), got {tuple(scalars.shape)}")
@@ -68,8 +68,6 @@ def lens_parts(tensors: Mapping[str, Tensor], notes: Mapping[str, str], path: st
             raise ValueError(f"mask_shift must be a number, got {described(shift)}")
         check_mask_shift(shift, float(parts["field"][0]))
         table = LensTable(**parts, mask_shift=float(shift))
-    except ValueError as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
     return LensParts(words["name"], words["source"], table=table, **given)
 
 

@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from kornia_tidy.files import parse_json, read_bytes
+from kornia_tidy.files import error_prefix, parse_json, read_bytes
 from kornia_tidy.optics.lens.codev_file import read_codev
 from kornia_tidy.optics.lens.file_surfaces import lens_of
 from kornia_tidy.optics.lens.json_lenses import read_json_lens
@@ -32,7 +32,7 @@ def read_prescription_file(path: str | os.PathLike[str]) -> tuple[Prescription, 
     if suffix not in SUFFIXES:
         raise ValueError(f"a prescription must be a file {', '.join(SUFFIXES)}, got {path}")
     data = read_bytes(path)
-    try:
+    with error_prefix(f"cannot read {path}", TypeError):
         if len(data) > LONGEST:
             raise ValueError(f"it must have at most {LONGEST} bytes, got {len(data)}")
         text = _text(data)
@@ -43,8 +43,6 @@ def read_prescription_file(path: str | os.PathLike[str]) -> tuple[Prescription, 
         else:
             found, height = lens_of(read_zemax(text) if suffix == ".zmx" else read_codev(text))
         return replace(found, name=found.name or Path(path).stem), height
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from None
 
 
 def _text(data: bytes) -> str:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 from kornia_tidy.optics.lens.file_surfaces import AIR, FileLens, FileSurface, number
-from kornia_tidy.optics.lens.glasses import catalogue_glass
 
 UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "METER": 1000.0, "M": 1000.0}
 TYPES = ("STANDARD", "EVENASPH", "ODDASPHE")
@@ -49,16 +47,8 @@ def read_zemax(text: str) -> FileLens:
     if unit not in UNITS:
         raise ValueError(f"its UNIT must be one of {', '.join(UNITS)}, got {unit!r:.60}")
     lens.unit = UNITS[unit]
-    if len(blocks) < 3:
-        raise ValueError(f"it must have an object, surfaces and a sensor, got {len(blocks)} of them")
     catalogues = header.get("GCAT", [[]])[-1]
-    found = [_surface(i, block, lens.indices, catalogues) for i, block in enumerate(blocks)]
-    first, sensor = found[0], found[-1]
-    if first.glass != AIR:
-        raise ValueError(f"the lens must stand in air, got {first.glass!r:.60} in front of it")
-    if not sensor.plane:
-        raise ValueError("its last surface is the sensor and must be a plane, got a curved one")
-    lens.distance, lens.surfaces = first.gap, found[1:-1]
+    lens.take([_surface(i, block, lens, catalogues) for i, block in enumerate(blocks)])
     if any(math.isinf(surface.gap) for surface in lens.surfaces):
         raise ValueError("distances between its surfaces must be finite, got INFINITY")
     lens.wavelength = _primary(header) or lens.wavelength
@@ -108,7 +98,7 @@ def _largest_field(header: dict[str, list[Sequence[str]]]) -> float | None:
     return math.hypot(*sides) or None
 
 
-def _surface(i: int, block: Sequence[Sequence[str]], indices: dict[str, Any], catalogues: Sequence[str]) -> FileSurface:
+def _surface(i: int, block: Sequence[Sequence[str]], lens: FileLens, catalogues: Sequence[str]) -> FileSurface:
     surface = FileSurface(f"surface {i}")
     lines: dict[str, list[Sequence[str]]] = {}
     for keyword, *words in block:
@@ -138,7 +128,7 @@ def _surface(i: int, block: Sequence[Sequence[str]], indices: dict[str, Any], ca
         terms = {value("PARM", words): value("PARM", words, 1) for words in lines.get("PARM", [])}
         surface.powers = _powers(surface.where, terms, 2 if kind == "EVENASPH" else 1)
     for words in lines.get("GLAS", []):
-        surface.glass = _glass(surface.where, words, indices, catalogues)
+        surface.glass = _glass(surface.where, words, lens, catalogues)
     surface.stop = "STOP" in lines
     edges = [_edge(surface.where, keyword, words) for keyword in _EDGES for words in lines.get(keyword, [])]
     surface.clear = next((edge for edge in edges if edge), None)
@@ -153,7 +143,7 @@ def _powers(where: str, terms: dict[float, float], step: int) -> dict[int, float
     return {step * int(term): value for term, value in terms.items() if value}
 
 
-def _glass(where: str, words: Sequence[str], indices: dict[str, Any], catalogues: Sequence[str]) -> str:
+def _glass(where: str, words: Sequence[str], lens: FileLens, catalogues: Sequence[str]) -> str:
     name = words[0] if words else ""
     if name.upper() == "AIR":
         return AIR
@@ -162,13 +152,8 @@ def _glass(where: str, words: Sequence[str], indices: dict[str, Any], catalogues
     if len(words) > 4 and words[1] == _MODEL:
         nd, vd = number(f"index of {where}", words[3]), number(f"Abbe number of {where}", words[4])
         name = f"{nd:g}/{vd:g}"
-        indices[name] = {"nd": nd, "vd": vd} if vd else nd
-    elif name not in indices:
-        try:
-            indices[name] = catalogue_glass(name, catalogues)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-    return name
+        lens.indices[name] = {"nd": nd, "vd": vd} if vd else nd
+    return lens.glass(where, name, catalogues)
 
 
 def _edge(where: str, keyword: str, words: Sequence[str]) -> float | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 from torch import nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.files import read_json, write_bytes
+from kornia_tidy.files import error_prefix, json_lines, read_json, standard, write_bytes
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.training.coded_datasets.layout import Layout
 from kornia_tidy.version import __version__
@@ -44,12 +43,12 @@ def conditions(
         "spectrum": asdict(optics.spectrum),
         "fidelity": asdict(optics.fidelity),
         **{name: getattr(optics, name) for name in ("window", "compositing", "color_space", "border")},
-        "state_sha256": _digest(optics),
+        "state_sha256": camera_digest(optics, settings=False),  # they are written in words
         "heights_m": [[[float(f"{h:.9g}") for h in row] for row in mask] for mask in optics.masks.heights().tolist()],
     }
     versions = {"kornia_tidy": __version__, "torch": torch.__version__}
     about = {"format": FORMAT, "versions": versions, "captures": count, "noise_seed": seed, "files": asdict(layout)}
-    return _plain({**about, "made_from": dict(made_from), **camera})
+    return json.loads(json.dumps(standard({**about, "made_from": dict(made_from), **camera}), default=str))
 
 
 def claim(folder: Path, own: Mapping[str, Any]) -> None:
@@ -63,13 +62,10 @@ def claim(folder: Path, own: Mapping[str, Any]) -> None:
     if not path.exists():  # checked after the other files, as another process writes it before them
         if others:
             raise ValueError(f"{folder} holds files that are no captures: choose another folder")
-        lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in own.items())
-        write_bytes(path, f"{{\n{lines}\n}}\n".encode())
+        write_bytes(path, json_lines(own))
         return
-    try:
+    with error_prefix(f"cannot read {path}", AttributeError):
         there = _flat(read_json(path))
-    except AttributeError as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
     here = _flat(own)
     if other := [name for name in {**there, **here} if there.get(name) != here.get(name)]:
         told = [_told(name, there.get(name), here.get(name)) for name in other]
@@ -88,24 +84,13 @@ def _part(module: nn.Module | None) -> dict[str, Any] | None:
     return {"is": repr(module), **numbers}
 
 
-def _digest(optics: TiDyOptics) -> str:
+def camera_digest(optics: TiDyOptics, *, settings: bool) -> str:
+    """Return a hash of a camera's weights and aperture, and of its settings if asked."""
     digest = hashlib.sha256()
     for name, value in {**optics.state_dict(), "aperture": optics.pupil.amplitude}.items():
-        if name.endswith(EXTRA_STATE):  # settings, which are written in words
-            continue
-        digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+        if settings or not name.endswith(EXTRA_STATE):
+            digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON reads it back."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    return value if isinstance(value, (str, bool, int, float, type(None))) else str(value)
 
 
 def _flat(values: Mapping[str, Any], place: str = "") -> dict[str, Any]:

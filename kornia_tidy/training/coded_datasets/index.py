@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import tarfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from kornia_tidy.files import check_file, parse_json, read_bytes, read_json, read_text
+from kornia_tidy.files import check_file, csv_bytes, parse_json, read_bytes, read_csv, read_json
 from kornia_tidy.training.coded_datasets.item_files import ABOUT
 from kornia_tidy.training.coded_datasets.layout import Layout, Part
 
@@ -26,14 +24,14 @@ def encode_index(folder: Path, parts: Iterable[Part], layout: Layout) -> bytes:
     Convention:
         A place is a path in the folder, or ``shard:offset:size`` in bytes, so that no shard has to be searched.
     """
-    text = io.StringIO()
     names = ("key", "name", "clamped_pixels", *layout.fields)
-    writer = csv.DictWriter(text, names, lineterminator="\n", extrasaction="ignore")
-    writer.writeheader()
-    for part in parts:
-        path = folder / part.name
-        writer.writerows([_folder_entry(path)] if layout.shard_items is None else _shard_entries(path))
-    return text.getvalue().encode()
+    paths = (folder / part.name for part in parts)
+    entries = (
+        each
+        for path in paths
+        for each in ([_folder_entry(path)] if layout.shard_items is None else _shard_entries(path))
+    )
+    return csv_bytes([names, *([entry.get(name, "") for name in names] for entry in entries)])
 
 
 def read_index(folder: Path) -> list[Entry]:
@@ -48,11 +46,7 @@ def read_index(folder: Path) -> list[Entry]:
         raise FileNotFoundError(
             f"{folder} has no {INDEX}, which rendering writes last: it has not ended, or is no such"
         )
-    text = read_text(path)
-    try:
-        entries = list(csv.DictReader(io.StringIO(text), strict=True))
-    except (csv.Error, ValueError) as error:
-        raise ValueError(f"cannot read {path}: {error}") from error
+    entries = read_csv(path)
     if not entries or not {"key", "name", "coded"} <= set(entries[0]) or any(map(_is_ragged, entries)):
         raise ValueError(f"cannot read {path}: it is no index of captures, or is damaged")
     return entries

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.data.image_files import encode_image
+from kornia_tidy.data.npy import encode_npy
 from kornia_tidy.data.stored import decode_stored
 from kornia_tidy.training.coded_datasets.layout import Layout
 
@@ -74,6 +74,4 @@ def decode_map(name: str, data: bytes, path: str) -> Tensor:
 def _encode_npy(values: Tensor) -> bytes:
     """Encode (C, H, W) as an NPY file (H, W, C), or (H, W) for one channel."""
     rows = values.detach().float().cpu().numpy().transpose(1, 2, 0)
-    data = io.BytesIO()
-    np.save(data, np.ascontiguousarray(rows[..., 0] if rows.shape[2] == 1 else rows), allow_pickle=False)
-    return data.getvalue()
+    return encode_npy(np.ascontiguousarray(rows[..., 0] if rows.shape[2] == 1 else rows))

@@ -23,7 +23,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.files import remove_leftovers, replacing, write_bytes, write_folder
+from kornia_tidy.files import output_folder, remove_leftovers, replacing, write_bytes, write_folder
 from kornia_tidy.render.repeatable import repeatable
 from kornia_tidy.search_path import starting_workers
 from kornia_tidy.seeds import keyed_seed
@@ -129,12 +129,11 @@ def render_scenes(
         ['000000', '000001', 'index.csv', 'render.json']
         ['coded.png', 'depth.npy', 'image.png', 'mask.png', 'scene.json']
     """
-    layout, folder = layout or Layout(), Path(folder)
+    layout = layout or Layout()
     if jobs < 1 or not 0 <= rank < world:
         raise ValueError(f"jobs must be 1 or more and rank one of {world} from 0, got {jobs} and {rank}")
     count = len(scenes)  # ty: ignore[invalid-argument-type]
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"cannot write into {folder}: it is not a folder")
+    folder = output_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     parts = layout.parts(count)
     own = parts[rank::world]

@@ -7,6 +7,7 @@ import torch
 
 from kornia_tidy import Fidelity, FresnelLens, TiDyOptics
 from kornia_tidy.design.tradeoff import Setting, capture, measure, pareto, sweep, sweep_settings
+from kornia_tidy.optics import Lens
 from kornia_tidy.psf import PSFModel
 from tests.base import BaseTester
 from tests.design.tradeoff.samples import ROW
@@ -25,10 +26,14 @@ def settings():
 
 
 class TestCapture(BaseTester):
-    def test_feature_is_the_linear_capture_without_noise(self):
+    @pytest.mark.parametrize("real", [False, True])
+    def test_feature_is_the_linear_capture_without_noise(self, real):
         image, depth = scene()
-        optics = TiDyOptics(fidelity="draft")
-        clean = TiDyOptics(optics.masks, fidelity=QUICK, sensor=None)  # encodes: decoded again by the formula of sRGB
+        lens = Lens.from_seidel(50e-3, 17.6, 0.595, field=5e-3, coma=2.0) if real else None
+        camera = None if lens is None else lens.camera(8e-6)
+        optics = TiDyOptics(camera=camera, fidelity="draft", lens=lens, field_center=(300.0, 300.0))
+        at = {"camera": camera, "lens": lens, "field_center": (300.0, 300.0)}
+        clean = TiDyOptics(optics.masks, fidelity=QUICK, sensor=None, **at)  # encodes: decoded again by sRGB's formula
         encoded = clean(image, depth).double()
         linear = torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
         self.assert_close(capture(optics, image, depth, QUICK), linear, rtol=0, atol=1e-5)

@@ -42,7 +42,9 @@ class TestFrameTimes(BaseTester):
         assert sum(line.swap for line in lines) / 0.08 == pytest.approx(float(weights[3:].sum()))
 
     def test_feature_the_sheet_is_csv_in_milliseconds(self):
-        rows = list(csv.DictReader(timing_sheet(frame_times((1, 3), 0.1, 0.02), ["a.png", "b.png"]).splitlines()))
+        rows = list(
+            csv.DictReader(timing_sheet(frame_times((1, 3), 0.1, 0.02), ["a.png", "b.png"]).decode().splitlines())
+        )
         assert rows[1] == {
             "frame": "1",
             "file": "b.png",

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_number
-from kornia_tidy.files import parse_json, read_bytes, write_bytes
+from kornia_tidy.files import error_prefix, parse_json, read_bytes, write_bytes
 from kornia_tidy.lab.calibration.noise.transfer_curve import (
     CurvePoint,
     black_planes,
@@ -285,7 +285,9 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         ValueError: if it is not a calibration of this format.
     """
     data = read_bytes(path)
-    try:
+    with error_prefix(
+        f"{path} is not a readable noise calibration", ArithmeticError, AttributeError, KeyError, TypeError
+    ):
         document = parse_json(data)
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
@@ -296,8 +298,6 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         if result.iso is not None:
             check_number("iso", result.iso)
         result.sensor_noise()
-    except (ArithmeticError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON's are ValueErrors
-        raise ValueError(f"{path} is not a readable noise calibration: {error!s:.200}") from None
     return result
 
 

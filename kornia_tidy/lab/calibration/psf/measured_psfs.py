@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_depth
-from kornia_tidy.files import parse_json
+from kornia_tidy.files import error_prefix, parse_json
 from kornia_tidy.lab.calibration.psf.disturbances import (
     check_clipping,
     check_diameter,
@@ -177,12 +177,10 @@ class MeasuredPSFs:
         bank = (FieldBank if notes.get("format") == FieldBank.form else PSFBank).load(path, device)
         names = [name for name in ("measured.uncertainty", "measured.distances") if name in found]
         tensors: dict[str, Any] = {name.removeprefix("measured."): found[name] for name in names}
-        try:
+        with error_prefix(f"{path} is a PSF bank, but not one that was measured", TypeError):
             reports = tuple(PointReport(**report) for report in parse_json(notes.get("reports", "")))
             measured = cls(bank, reports=reports, **tensors)
             return replace(measured, camera=_lens(notes["camera"], measured)) if "camera" in notes else measured
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{path} is a PSF bank, but not one that was measured: {error}") from None
 
     def in_words(self) -> list[tuple[str, str]]:
         """Return the omitted captures, and the accuracy at each distance, as topics and texts."""
@@ -223,8 +221,8 @@ def _over(camera: ThinLensCamera, distances: Tensor) -> ThinLensCamera:
     near, far = float(distances.min()), float(distances.max())
     if near == far:
         near, far = near * (1 - ONE_DISTANCE), far * (1 + ONE_DISTANCE)
-    lens: dict[str, Any] = {name: float(getattr(camera, name)) for name in LENS}
-    return ThinLensCamera(depth_range=(near, far), **lens)
+    focus = float(camera.focus_distance)
+    return camera.changed(focus_distance=focus, depth_range=(near, far), lens_material=None)  # files have no material
 
 
 def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil | None = None) -> float:
