@@ -2,7 +2,7 @@
 
 Distances, wavelengths and names of materials and cameras come in. Defocus in radians, aperture amplitudes, refractive
 indices and channel weights of wavelengths go out. ``quadrature.py`` integrates over pupil cells; ``units.py`` warns of
-inputs in a wrong unit. Read ``thin_lens.py`` first.
+inputs in a wrong unit. Read ``thin_lens.py`` first, which has the default lens.
 """
 
 from kornia_tidy.optics.aperture import annular_aperture, circular_aperture

@@ -1,7 +1,8 @@
 """From the pupil to point spread functions: propagation, interpolation over defocus, the PSF bank and its cache.
 
 Masks, modulator, camera, spectrum and fidelity come in as a PSF model; PSFs at each layer's defocus go out as a bank.
-Read ``psf_model.py`` first; ``exact.py`` and ``paper.py`` are the two propagations.
+Read ``psf_model.py`` first, from which layers get them; ``psf_cache.py`` remembers them, ``exact.py`` and ``paper.py``
+are the two propagations.
 """
 
 from kornia_tidy.psf.exact import exact_psf_bank

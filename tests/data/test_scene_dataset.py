@@ -27,7 +27,19 @@ from kornia_tidy.data import (
 from tests.base import BaseTester
 from tests.data.published import write_flying_things, write_frames, write_nyu
 
-KINDS = ("dead leaves", "photographic leaves", "photo collages", "flying things", "nyu", "folder", "tum", "sun rgb-d")
+THINGS = {"kind": "disparity", "focal_px": 1050.0, "baseline_m": 1.0}
+KINDS = {
+    "dead leaves": lambda root: DeadLeaves(3, 40, 48, num_leaves=60),
+    "photographic leaves": lambda root: PhotographicLeaves(3, 40, 48),
+    "photo collages": lambda root: PhotoCollages(photographs_in(root / "frames_cleanpass"), 3, 40, 48),
+    "flying things": FlyingThings3D,
+    "nyu": lambda root: NYUDepthV2(root, "all"),
+    "folder": lambda root: RGBDFolder(
+        root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **THINGS
+    ),
+    "tum": lambda root: TUMSequence(root / "tum"),
+    "sun rgb-d": lambda root: SUNRGBD(root / "sun"),
+}
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +52,7 @@ def data(tmp_path_factory):
     write_frames(root / "sun", "{}/image/a.png", "{}/depth_bfx/b.png")
     for part in ("rgb", "depth"):
         (root / f"tum/{part}.txt").write_text("".join(f"{i} {part}/{i}.png\n" for i in range(3)))
-    things = {"kind": "disparity", "focal_px": 1050.0, "baseline_m": 1.0}
-    sets = (
-        DeadLeaves(3, 40, 48, num_leaves=60),
-        PhotographicLeaves(3, 40, 48),
-        PhotoCollages(photographs_in(root / "frames_cleanpass"), 3, 40, 48),
-        FlyingThings3D(root),
-        NYUDepthV2(root, "all"),
-        RGBDFolder(root, "frames_cleanpass/TRAIN/*/*/*/*.png", "disparity/TRAIN/*/*/*/*.pfm", **things),
-        TUMSequence(root / "tum"),
-        SUNRGBD(root / "sun"),
-    )
-    return dict(zip(KINDS, sets, strict=True))
+    return {kind: make(root) for kind, make in KINDS.items()}
 
 
 class Stub(SceneDataset):

@@ -78,7 +78,7 @@ class TestWiener(BaseTester):
             wiener(capture, psfs, -0.1)
         with pytest.raises(ValueError, match=r"noise must be .* got nan"):
             Wiener(math.nan)
-        with pytest.raises(ValueError, match=r"\(D, 1, P, P\) with P odd for a capture of 1 channels, got \(3, 2, 5"):
+        with pytest.raises(ValueError, match=r"\(\.\.\., 1, P, P\) with P odd .* 1 channels, got \(3, 2, 5"):
             wiener(capture[:, :1], psfs, 0.1)
         with pytest.raises(ValueError, match=r"psfs must have shape \(D, C, P, P\), got \(2, 5, 5\)"):
             wiener(capture, psfs[0], 0.1)

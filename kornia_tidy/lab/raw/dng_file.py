@@ -1,4 +1,4 @@
-"""DNG files of raw captures: lossless counts with levels, filter array, colours and camera data."""
+"""Writing of raw captures as DNG files: lossless counts with levels, filter array, colours and camera data."""
 
 from __future__ import annotations
 
