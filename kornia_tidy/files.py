@@ -274,11 +274,11 @@ def error_prefix(words: str, *others: type[Exception]) -> Generator[None]:
         ValueError: with the words.
 
     Example:
-        >>> with error_prefix("cannot read list.json", TypeError):
-        ...     None["rgb"]
+        >>> with error_prefix("cannot read list.json", KeyError):
+        ...     {}["rgb"]
         Traceback (most recent call last):
         ...
-        ValueError: cannot read list.json: 'NoneType' object is not subscriptable
+        ValueError: cannot read list.json: 'rgb'
     """
     try:
         yield

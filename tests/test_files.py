@@ -10,7 +10,19 @@ import threading
 import pytest
 
 from kornia_tidy.data import read_image
-from kornia_tidy.files import only_here, parse_json, read_bytes, read_json, write_bytes, write_folder
+from kornia_tidy.files import (
+    check_folder,
+    csv_bytes,
+    error_prefix,
+    only_here,
+    output_folder,
+    parse_json,
+    read_bytes,
+    read_csv,
+    read_json,
+    write_bytes,
+    write_folder,
+)
 from tests.base import BaseTester
 from tests.forks import fork, wait
 
@@ -67,6 +79,26 @@ class TestReading(BaseTester):
     def test_exception_json_that_is_none_or_may_do_harm(self, text, sentence):
         with pytest.raises(ValueError, match=sentence):
             parse_json(text)
+
+    def test_exception_the_prefix_stands_once_and_names_the_kinds_that_are_told(self):
+        with pytest.raises(ValueError, match=r"^cannot read a\.csv: 'rgb'$"):
+            with error_prefix("cannot read a.csv", KeyError), error_prefix("cannot read a.csv", KeyError):
+                {}["rgb"]
+        with pytest.raises(KeyError), error_prefix("cannot read a.csv"):
+            {}["rgb"]
+
+    def test_feature_a_table_comes_back_as_texts(self, tmp_path):
+        write_bytes(tmp_path / "a.csv", csv_bytes([["name", "psnr"], ["a, b", 3.5], ['say "c"', ""]]))
+        assert read_csv(tmp_path / "a.csv") == [{"name": "a, b", "psnr": "3.5"}, {"name": 'say "c"', "psnr": ""}]
+
+    def test_exception_folders(self, tmp_path):
+        (tmp_path / "file").touch()
+        with pytest.raises(FileNotFoundError, match="there is no folder .*file"):
+            check_folder(tmp_path / "file")
+        with pytest.raises(ValueError, match="cannot write into .*file: it is not a folder"):
+            output_folder(tmp_path / "file")
+        assert output_folder(tmp_path / "new") == tmp_path / "new"
+        assert check_folder(str(tmp_path)) == tmp_path
 
 
 class TestWriting(BaseTester):

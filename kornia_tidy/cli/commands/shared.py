@@ -67,16 +67,8 @@ class DepthFile:
         """Read a picture with its depth."""
         from kornia_tidy.data.rgbd import read_rgbd
 
-        return read_rgbd(
-            image,
-            depth,
-            scale=self.depth_scale,
-            kind=self.depth_kind,
-            invalid=self.invalid,
-            focal_px=self.focal_px,
-            baseline_m=self.baseline_m,
-            doffs_px=self.doffs_px,
-        )
+        options = dict(vars(self))
+        return read_rgbd(image, depth, scale=options.pop("depth_scale"), kind=options.pop("depth_kind"), **options)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -256,20 +256,9 @@ def _camera(optics: TiDyOptics, fidelity: str | Fidelity, image: Tensor) -> TiDy
     fidelity = Fidelity.preset(fidelity) if isinstance(fidelity, str) else fidelity
     widest = largest_window(optics.border, *image.shape[-2:])
     fidelity = replace(fidelity, max_window=min(fidelity.max_window, widest))
-    camera = TiDyOptics(
-        optics.masks,
-        camera=optics.camera,
-        modulator=optics.modulator,
-        sensor=None,
-        fidelity=fidelity,
-        compositing=optics.compositing,
-        color_space="paper" if fidelity.propagation == "paper" else "linear",  # neither decodes nor encodes
-        border=optics.border,
-        spectrum=optics.spectrum,
-        aperture=optics.aperture,
-        lens=optics.lens,
-        field_center=optics.field_center,
-    )
+    camera = optics.with_fidelity(fidelity)
+    camera.sensor = None
+    camera.color_space = "paper" if fidelity.propagation == "paper" else "linear"  # neither decodes nor encodes
     # That of a wide defocus disc may be larger than the border allows.
     return camera if camera.window <= widest else camera.with_fidelity(replace(fidelity, window=widest))
 
