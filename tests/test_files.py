@@ -81,9 +81,9 @@ class TestReading(BaseTester):
             parse_json(text)
 
     def test_exception_the_prefix_stands_once_and_names_the_kinds_that_are_told(self):
-        with pytest.raises(ValueError, match=r"^cannot read a\.csv: 'rgb'$"):
-            with error_prefix("cannot read a.csv", KeyError), error_prefix("cannot read a.csv", KeyError):
-                {}["rgb"]
+        twice, named = error_prefix("cannot read a.csv", KeyError), error_prefix("cannot read a.csv", KeyError)
+        with pytest.raises(ValueError, match=r"^cannot read a\.csv: 'rgb'$"), twice, named:
+            {}["rgb"]
         with pytest.raises(KeyError), error_prefix("cannot read a.csv"):
             {}["rgb"]
 
@@ -93,9 +93,9 @@ class TestReading(BaseTester):
 
     def test_exception_folders(self, tmp_path):
         (tmp_path / "file").touch()
-        with pytest.raises(FileNotFoundError, match="there is no folder .*file"):
+        with pytest.raises(FileNotFoundError, match=r"there is no folder .*file"):
             check_folder(tmp_path / "file")
-        with pytest.raises(ValueError, match="cannot write into .*file: it is not a folder"):
+        with pytest.raises(ValueError, match=r"cannot write into .*file: it is not a folder"):
             output_folder(tmp_path / "file")
         assert output_folder(tmp_path / "new") == tmp_path / "new"
         assert check_folder(str(tmp_path)) == tmp_path
