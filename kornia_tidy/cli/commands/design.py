@@ -59,10 +59,10 @@ class Design:
     white pixel at one f-number, and falls with the square of the f-number. Where white would
     exceed the full well of a pixel the exposure is shorter.
 
-      search    flat lenses and masks at f-numbers one stop apart, by the error of the best linear
-                restoration (and of depth by texture); masks start from a
-                focal sweep, a Fisher mask and noise, and see the modulator's switching and
-                grey levels
+      search    flat lenses and masks at f-numbers one stop apart, by the error of the
+                best linear restoration (and of depth by texture); masks start from a
+                focal sweep, a Fisher mask and noise, and see the modulator's switching
+                and grey levels
       captures  the best of both take pictures of scenes (dead leaves, and yours), which the
                 best closed form restores; settings are chosen on one half of the scenes,
                 scores are from the other

@@ -19,10 +19,10 @@ class Evaluate:
     """Measure the errors of a trained system.
 
     A trained camera and network, or the closed form of a camera that was measured, is
-    evaluated on scenes that were not used for training. With --psfs and --noise the captures are
-    those of the measured camera, and a network that deconvolves them uses its PSFs. FOLDER
-    gets results.csv (one line per scene), summary.json (means and settings), and pictures of
-    the first scenes: capture, estimates, ground truth, and errors times 3.
+    evaluated on scenes that were not used for training. With --psfs and --noise the
+    captures are those of the measured camera, and a network that deconvolves them uses its
+    PSFs. FOLDER gets results.csv (one line per scene), summary.json (means and settings),
+    and pictures of the first scenes: capture, estimates, ground truth, and errors times 3.
 
     image_rmse, image_psnr (dB), image_ssim: of the image in [0, 1], without clipping.
     depth_rmse: of normalised inverse depth, 0 at the far and 1 at the near end of the

@@ -102,8 +102,8 @@ class ExportMasks:
     r"""Write SLM frames or heights.
 
     A state_dict tells the masks' family, constraint and material, and the modulator; its
-    grey levels, dwell and switching times are the defaults of frames. One of only masks (phase in radians at 530 nm)
-    lacks them. The name of OUT gives the format:
+    grey levels, dwell and switching times are the defaults of frames. One of only masks
+    (phase in radians at 530 nm) lacks them. The name of OUT gives the format:
       a folder  one frame per mask for the panel of a phase modulator (PNG or TIFF),
                 timing.csv, and frames.json with the settings needed to read them
                 back; up to 8 bits in 8-bit files, 9 and 10 in the least

@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 class CalibratePsf:
     r"""Make a PSF bank from pictures of a point.
 
-    The pictures show a point of light at known distances.
-    At each distance the point is moved by some pixels and fractions of a pixel between
-    the pictures: an undersampled PSF can only be reconstructed from several of them, and
-    dust on the sensor stays where it is. 16 positions are good, 24 behind a filter array;
-    they need not be known. Several exposures at each
-    position, the longer ones saturated, measure the faint parts of a PSF as well. FILES
-    are raw files or 16-bit images of linear light without black level, sorted by
-    distance, then by position of the point, then by exposure. The planes of one colour of
-    a filter array give one PSF on the pixel grid of the sensor, so that the bank has red,
-    green and blue.
+    The pictures show a point of light at known distances. At each distance the point is
+    moved by some pixels and fractions of a pixel between the pictures: an undersampled PSF
+    can only be reconstructed from several of them, and dust on the sensor stays where it
+    is. 16 positions are good, 24 behind a filter array; they need not be known. Several
+    exposures at each position, the longer ones saturated, measure the faint parts of a PSF
+    as well. FILES are raw files or 16-bit images of linear light without black level,
+    sorted by distance, then by position of the point, then by exposure. The planes of one
+    colour of a filter array give one PSF on the pixel grid of the sensor, so that the bank
+    has red, green and blue.
 
     Args:
         files: raw files, or 16-bit images of linear light.
