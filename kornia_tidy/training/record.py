@@ -26,6 +26,7 @@ def training_record(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
     Example:
         >>> import tempfile
+        >>> from pathlib import Path
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = Path(folder, "validation.csv").write_text("epoch,val_loss\n0,0.5\n")
         ...     training_record(folder)
