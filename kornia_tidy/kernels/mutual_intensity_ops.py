@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, load
-from kornia_tidy.kernels.operators import define
+from kornia_tidy.kernels.operators import define, differentiable_gradients
 
 SOURCE = KERNELS / "mutual_intensity.c"
 
@@ -90,25 +90,19 @@ def _keep(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> No
     ctx.save_for_backward(*inputs)
 
 
+def _by_torch(field: Tensor, weights: Tensor, kernels: Tensor) -> Tensor:
+    """Return the energies of the waves :math:`K U K^T`, formed one by one."""
+    window, order = kernels.shape[1:3]
+    waves = [kernel @ field @ kernel.mT for kernel in kernels.flatten(1, 2)]
+    energies = [torch.tensordot(weights, wave.real.square() + wave.imag.square(), 1) for wave in waves]
+    return torch.stack(energies).view(-1, window, order, window, order).sum((2, 4))
+
+
 def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    r"""Return the gradients from those of the waves :math:`W = K U K^T`, which are :math:`2 w g W`."""
-    field, weights, kernels = ctx.saved_tensors
-    if not torch.is_grad_enabled() and not any(ctx.needs_input_grad[1:]):
-        return torch.ops.kornia_tidy.mutual_field_gradient(field, weights, kernels, gradient), None, None
-    order = kernels.shape[2]
-    of_field, of_weights = torch.zeros_like(field), torch.zeros_like(weights)
-    of_kernels: list[Tensor] = []
-    for kernel, light in zip(kernels.flatten(1, 2), gradient, strict=True):
-        every = light.repeat_interleave(order, 0).repeat_interleave(order, 1)
-        half = kernel @ field
-        wave = half @ kernel.mT
-        energy = wave.real.square() + wave.imag.square()
-        of_weights = of_weights + (energy * every).sum((1, 2))
-        of_wave = 2 * weights[:, None, None] * every * wave
-        to_half = of_wave @ kernel.conj()
-        of_field = of_field + kernel.mH @ to_half
-        of_kernels.append((to_half @ field.mH + of_wave.mT @ half.conj()).sum(0))
-    return of_field, of_weights, torch.stack(of_kernels).view(kernels.shape)
+    wanted = ctx.needs_input_grad
+    if not torch.is_grad_enabled() and not any(wanted[1:]):
+        return torch.ops.kornia_tidy.mutual_field_gradient(*ctx.saved_tensors, gradient), None, None
+    return tuple(differentiable_gradients(_by_torch, ctx.saved_tensors, gradient, wanted))
 
 
 _WAVES = "Tensor field, Tensor weights, Tensor kernels"

@@ -6,7 +6,7 @@ Operators are defined by schema, as ``torch.library.custom_op`` would import the
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 import torch
@@ -44,6 +44,33 @@ def define(
     torch.library.impl(operator, devices, compute)
     torch.library.register_fake(operator, fake)
     torch.library.register_autograd(operator, backward or refuse, setup_context=keep)
+
+
+def differentiable_gradients(
+    function: Callable[..., Tensor], inputs: Sequence[Tensor | None], gradient: Tensor, wanted: Sequence[bool]
+) -> list[Tensor | None]:
+    """Return gradients of a function of plain operations, which can be differentiated in turn.
+
+    Args:
+        function: of the inputs.
+        inputs: tensors, or None.
+        gradient: of its result.
+        wanted: inputs that need a gradient.
+
+    Example:
+        >>> x = torch.tensor(3.0, requires_grad=True)
+        >>> (gradient,) = differentiable_gradients(lambda x: x**3, [x], torch.tensor(1.0), [True])
+        >>> gradient.item(), torch.autograd.grad(gradient, x)[0].item()
+        (27.0, 18.0)
+    """
+    with torch.enable_grad():
+        # Views, so that a gradient ends here, though one input may be made of another.
+        own = [None if x is None else x.view_as(x) for x in inputs]
+        asked = [x for x, want in zip(own, wanted, strict=True) if want and x is not None]
+        result = function(*own)
+        found = torch.autograd.grad(result, asked, gradient.to(result), create_graph=True, allow_unused=True)
+    each = iter(found)
+    return [next(each) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
 class Parameters(ctypes.Structure):

@@ -31,7 +31,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.kernels.operators import define
+from kornia_tidy.kernels.operators import define, differentiable_gradients
 from kornia_tidy.kernels.shot_noise import drawn_electrons
 from kornia_tidy.mode import Mode, torch_mode
 
@@ -200,8 +200,8 @@ def _define(name: str, schema: str, tensors: int, call: Callable[..., Tensor], b
         given = *fields, *ctx.options
         if not torch.is_grad_enabled():
             return getattr(torch.ops.kornia_tidy, of_gradient)(x, gradient, *given), *[None] * len(given)
-        own = x.view_as(x)  # the gradient is differentiated in turn
-        return *torch.autograd.grad(by_torch(own, *given), own, gradient, create_graph=True), *[None] * len(given)
+        gradients = differentiable_gradients(lambda own: by_torch(own, *given), [x], gradient, [True])
+        return *gradients, *[None] * len(given)
 
     schemas = f"({schema}) -> Tensor", f"({first}, Tensor gradient, {rest}) -> Tensor"
     define(name, schemas[0], lambda x, *given: call(new(x, *given), x, None, *given), new, backward, keep)

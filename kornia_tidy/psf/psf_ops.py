@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.operators import define
+from kornia_tidy.kernels.operators import define, differentiable_gradients
 from kornia_tidy.mode import recording_in_operator
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
@@ -125,13 +125,14 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
     (phase, weights, amplitude), wanted = ctx.saved_tensors, list(ctx.needs_input_grad[:2])
     rest = [None] * (1 + len(ctx.lens))
     if torch.is_grad_enabled():  # it is differentiated in turn
+
+        def made(*shown: Tensor) -> Tensor:
+            return _computed(*shown, amplitude, *ctx.lens)
+
         with torch.autocast(gradient.device.type, enabled=False):
-            psfs = _computed(phase, weights, amplitude, *ctx.lens)
-            inputs = [x for x, want in zip((phase, weights), wanted, strict=True) if want]
-            found = iter(torch.autograd.grad(psfs, inputs, gradient, create_graph=True))
-    else:
-        operator = torch.ops.kornia_tidy.exact_psfs_gradients
-        found = iter(operator(phase, weights, amplitude, *ctx.lens, gradient, wanted) if any(wanted) else ())
+            return *differentiable_gradients(made, (phase, weights), gradient, wanted), *rest
+    operator = torch.ops.kornia_tidy.exact_psfs_gradients
+    found = iter(operator(phase, weights, amplitude, *ctx.lens, gradient, wanted) if any(wanted) else ())
     return *(next(found) if want else None for want in wanted), *rest
 
 

@@ -15,13 +15,13 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.kernels.operators import define
+from kornia_tidy.kernels.operators import define, differentiable_gradients
 from kornia_tidy.mode import Mode, recording_in_operator, torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.backend import Backend, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
-from kornia_tidy.render.backends.dense import DenseBackend, differentiable_gradients
+from kornia_tidy.render.backends.dense import DenseBackend
 from kornia_tidy.render.scene import LayeredScene, check_nodes, layered_scene
 from kornia_tidy.render.stray_light import stray_light_of
 

@@ -6,7 +6,6 @@ differentiated in turn is made by this backend instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -109,31 +108,6 @@ def scatter_dense(plane: Tensor, psfs: Tensor, layer_weight: Tensor | None, laye
         own = weight_of_layer(index, weight, layer) * plane
         light = light + to_spectrum(own, size) * to_spectrum(psfs[layer], size)
     return from_spectrum(light, size, side)
-
-
-def differentiable_gradients(
-    render: Callable[..., Tensor], inputs: Sequence[Tensor | None], grad: Tensor, wanted: Sequence[bool]
-) -> list[Tensor | None]:
-    """Return gradients of a rendered image that can be differentiated in turn.
-
-    Args:
-        render: function of the inputs that returns the image.
-        inputs: tensors, or None.
-        grad: gradient of the result.
-        wanted: inputs that need a gradient.
-
-    Example:
-        >>> x = torch.tensor(3.0, requires_grad=True)
-        >>> (gradient,) = differentiable_gradients(lambda x: x**3, [x], torch.tensor(1.0), [True])
-        >>> gradient.item(), torch.autograd.grad(gradient, x)[0].item()
-        (27.0, 18.0)
-    """
-    # Views, so that a gradient ends here, though one input may be made of another.
-    own = [None if x is None else x.view_as(x) for x in inputs]
-    asked = [x for x, want in zip(own, wanted, strict=True) if want and x is not None]
-    coded = render(*own)
-    found = iter(torch.autograd.grad(coded, asked, grad.to(coded), create_graph=True, allow_unused=True))
-    return [next(found) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
 def dense_work(scene: LayeredScene, layers: int, at_once: int) -> Work:
