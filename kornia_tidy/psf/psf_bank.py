@@ -108,7 +108,13 @@ class BankOfPSFs:
         return replace(self, psfs=(1 - TAILS) * self.psfs + TAILS * light * (tails / tails.sum()))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """Return the bank on a device and in a data type; None: unchanged."""
+        """Return the bank on a device and in a data type; None: unchanged.
+
+        Example:
+            >>> bank = PSFBank(torch.ones(1, 1, 1, 1), torch.zeros(1), torch.ones(1, 1))
+            >>> [bank.to("cpu", dtype).psfs.dtype for dtype in (None, torch.float64)]
+            [torch.float32, torch.float64]
+        """
         return type(self)(**{k: value.to(device, dtype or value.dtype) for k, value in self.present().items()})
 
     def at_defocus(self, defocus: Sequence[float]) -> Self:
