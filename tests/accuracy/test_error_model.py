@@ -70,6 +70,13 @@ class TestPower(BaseTester):
         error = change_error((0.0,), -0.1 * torch.ones(1, 1, 1, 1), light_there)
         assert error == pytest.approx(0.1 * float(light.std(correction=0)), rel=0.05)
 
+    def test_feature_the_error_grows_with_the_brightness(self):
+        power = power_spectrum(torch.rand(1, 1, 60, 60, dtype=torch.float64), "reflect", 64)
+        change = torch.zeros(1, 1, 3, 3, dtype=torch.float64)
+        change[..., 1, :] = torch.tensor([0.1, -0.2, 0.1])
+        dim, bright = (change_error((0.0,), change, one_depth(power * scale**2)) for scale in (1, 1000))
+        assert bright == pytest.approx(1000 * dim)
+
     def test_feature_one_depth_is_the_image_and_two_have_outlines(self):
         """Of white light, which one depth leaves alone."""
         white = torch.ones(1, 1, 20, 20)
