@@ -227,9 +227,13 @@ class TestRefused(BaseTester):
                 decoded(data[:kept])
 
     def test_exception_too_many_pixels(self):
-        for fields in ({256: (4, [10**6]), 257: (4, [10**6])}, {257: (16, [2**63])}):
-            with pytest.raises(ValueError, match=r"the picture has \d+ x \d+ pixels, more than 268435456: set"):
-                decoded(tiff(Page(RGB, photometric=2, fields=fields), big=True))
+        for tiles, fields in (
+            ("", {256: (4, [10**6]), 257: (4, [10**6])}),
+            ("", {257: (16, [2**63])}),
+            (" in whole tiles", {322: (4, [10**6]), 323: (4, [10**6])}),
+        ):
+            with pytest.raises(ValueError, match=rf"the picture{tiles} has \d+ x \d+ pixels, more than 268435456: set"):
+                decoded(tiff(Page(RGB, photometric=2, tile=(16, 16), fields=fields), big=True))
 
     def test_feature_a_stack_is_no_depth_of_its_first_page(self, tmp_path):
         """OpenCV, Pillow and others read the first page without a word."""
