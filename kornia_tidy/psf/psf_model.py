@@ -447,8 +447,7 @@ class PSFModel:
                     bank = self._computed_bank(spectrum, dtype, nodes, group=group)
                 bank = learnt_bank(bank, exact, states, weights, grid)
                 return bank if stray_light is None else bank.with_stray_light(*stray_light)
-            shares = [sum(row) for row in spectrum.plane_weights]
-            lens = blur, self.pupil, float(self.pixel_step), grid, shares, side
+            lens = blur, self.pupil, float(self.pixel_step), grid, len(spectrum.weights), side
             build = partial(wide_psfs, partial(exact, states, weights), *lens, like=states)
 
         def finished(bank: PSFBank) -> PSFBank | FieldBank:

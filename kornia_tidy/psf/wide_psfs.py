@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -25,7 +25,7 @@ def wide_psfs(
     pupil: Pupil,
     step: float,
     grid: int,
-    shares: Sequence[float],
+    channels: int,
     window: int,
     nodes: tuple[float, ...],
     like: Tensor,
@@ -38,19 +38,19 @@ def wide_psfs(
         pupil: the aperture.
         step: a sensor pixel seen from the pupil in metres.
         grid: sensor pixels along a side of a pixel of the grid.
-        shares: light that each channel sees of white.
+        channels: number of colour channels.
         window: side of the PSFs in pixels of the grid.
         nodes: defocus in radians, ascending.
         like: a tensor of the PSFs' type and device.
     """
     by_waves = torch.tensor([blur_radius(psi, step) < blur.ray_radius for psi in nodes], device=like.device)
-    psfs, at = like.new_empty(len(nodes), len(shares), window, window), torch.tensor(nodes, dtype=torch.float64)
+    psfs, at = like.new_empty(len(nodes), channels, window, window), torch.tensor(nodes, dtype=torch.float64)
     small, large = (tuple(at[which.cpu()].tolist()) for which in (by_waves, ~by_waves))
     if small:
         psfs[by_waves] = exact(small, window).psfs
     if large:
         rays = geometric_psfs(pupil.transmission.to(like.device), pupil.cell_pitch, large, step * grid, window)
-        psfs[~by_waves] = rays.to(like)[:, None] * like.new_tensor(list(shares))[:, None, None]
+        psfs[~by_waves] = rays.to(like)[:, None]  # the same at all wavelengths
     return PSFBank(psfs, psfs.new_tensor(nodes), psfs.sum((2, 3)))
 
 
