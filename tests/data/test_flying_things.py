@@ -129,10 +129,6 @@ class TestPaperPatches(BaseTester):
         assert sample["index"] == length - 1
         self.assert_close(sample["depth"], 255 / 8 * sample["image"][:1] / 160)
 
-    def test_exception_names_the_bad_split(self, root):
-        with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'dev'"):
-            paper_patches(root, "dev")
-
 
 class TestSplitFrames(BaseTester):
     def test_feature_whole_sequences_are_held_out_and_no_frame_is_in_two_splits(self, tmp_path):
@@ -154,3 +150,5 @@ class TestSplitFrames(BaseTester):
             split_frames(root)
         with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'validation'"):
             split_frames(root, "validation")
+        with pytest.raises(ValueError, match="split must be one of 'train', 'val', 'test', got 'dev'"):
+            paper_patches(root, "dev")

@@ -121,13 +121,11 @@ class TestWriteImage(BaseTester):
         with pytest.raises(ValueError, match=message):
             write_image(tmp_path / name, image, **options)
 
-    def test_exception_integers_or_no_folder(self, tmp_path):
+    def test_exception_integers_no_folder_or_a_folder(self, tmp_path):
         with pytest.raises(TypeError, match="uint8"):
             write_image(tmp_path / "a.png", torch.zeros(1, 2, 2).byte())
         with pytest.raises(FileNotFoundError, match=r"there is no folder .*none"):
             write_image(tmp_path / "none" / "a.png", torch.zeros(1, 2, 2))
-
-    def test_exception_path_is_a_folder(self, tmp_path):
         (tmp_path / "a.png").mkdir()
         with pytest.raises(ValueError, match="it is a folder"):
             write_image(tmp_path / "a.png", torch.zeros(1, 2, 2))
