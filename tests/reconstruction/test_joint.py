@@ -17,7 +17,7 @@ class TestJointHead(BaseTester):
         assert torch.equal(depth, maps[:, :1])
         assert torch.equal(image, maps[:, 1:])
 
-    def test_convention_more_channels_are_a_distribution_of_depth(self):
+    def test_feature_more_channels_are_a_distribution_of_depth(self):
         maps = torch.zeros(2, 6, 8, 8)
         maps[:, :3] = torch.tensor([2.0, 1.0, 1.0]).log().view(3, 1, 1)  # not negative, as a capture is
         estimate = JointHead(SeeingHead(6, 6))(maps)

@@ -86,6 +86,7 @@ def seam(head, image, **options):
     counted = []
     tiled = reconstruct_tiled(head, image, progress=lambda done, of: counted.append(of), **options)
     whole = head(image.contiguous(memory_format=torch.channels_last))
+    assert type(tiled) is type(whole)
     difference = max(float((a - b).abs().max()) for a, b in zip(maps_of(tiled), maps_of(whole), strict=True))
     return difference, len(counted), max(float(part.abs().max()) for part in maps_of(whole))
 
