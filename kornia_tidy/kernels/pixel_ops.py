@@ -1,13 +1,13 @@
 r"""Pixel values: sRGB decoded to linear light and back, and what a sensor records. In C for processors, else in torch.
 
-Every number of the result is made of those in the same place of some tensors.
+Each number of the result follows from the numbers at the same place of some tensors.
 
 .. math::
     L(x) = \begin{cases} x / 12.92 & x \le 0.04045 \\ ((x + 0.055) / 1.055)^{2.4} & \text{else} \end{cases}
     \qquad
     x(L) = \begin{cases} 12.92 \, L & L \le 0.0031308 \\ 1.055 \, L^{1 / 2.4} - 0.055 & \text{else} \end{cases}
 
-Values above 1 go by the power, negative ones by the line. Up to 1 the operators are at most 2e-7 off in float32.
+Values above 1 follow the power law, negative ones the straight line. Up to 1 the operators are at most 2e-7 off in float32.
 
 .. math::
     N = \mathrm{Poisson}(w \max(x, 0) + d), \qquad
@@ -43,7 +43,7 @@ def decode(image: Tensor, color_space: str = "srgb") -> Tensor:
 
     Args:
         image: floating point, of any shape and on any device.
-        color_space: ``"srgb"``; of any other the image is light.
+        color_space: ``"srgb"``; in any other the image is the light.
 
     Returns:
         Of the same shape, dtype and device. It has gradients, which can be differentiated in turn.

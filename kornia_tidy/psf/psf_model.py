@@ -695,7 +695,7 @@ class PSFModel:
 
     @property
     def layering(self) -> Layering:
-        """Nodes, window and wide blur of PSFs that are computed: all that a capture asks before it asks for PSFs.
+        """Nodes, window and wide blur of computed PSFs: all that a capture needs before the PSFs.
 
         They stay while the camera's range and the modulator's pixels stay, and flat masks flat where blur is wide.
         """

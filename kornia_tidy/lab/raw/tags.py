@@ -90,7 +90,7 @@ def camera_tags(data: bytes) -> dict[str, Any]:
 def orientation_known(directories: list[Directory]) -> bool:
     """Return False if a file gives orientations, and none of them is one of Exif's eight.
 
-    LibRaw takes the last three bits of any number: a quarter turn for 0, which stands for an unknown orientation.
+    LibRaw takes the last three bits of any number: a quarter turn for 0, which means an unknown orientation.
     """
     given = [value for values in _values(directories, (ORIENTATION,)) for value in values]
     return not given or any(value in range(1, 9) for value in given)
