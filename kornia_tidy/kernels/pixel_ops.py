@@ -7,7 +7,7 @@ Each number of the result follows from the numbers at the same place of some ten
     \qquad
     x(L) = \begin{cases} 12.92 \, L & L \le 0.0031308 \\ 1.055 \, L^{1 / 2.4} - 0.055 & \text{else} \end{cases}
 
-Values above 1 follow the power law, negative ones the straight line. Up to 1 the operators are at most 2e-7 off in float32.
+Values above 1 follow the power law, negative ones the line. Up to 1 the operators are at most 2e-7 off in float32.
 
 .. math::
     N = \mathrm{Poisson}(w \max(x, 0) + d), \qquad
