@@ -19,8 +19,8 @@ def best_wiener_kernels(psfs: Tensor, noises: tuple[float, ...]) -> Tensor:
     r"""Return Wiener kernels of bounded size, each for its noise or for a larger one if that is better.
 
     Where PSFs fill their window, such as those of random masks, the inverse for little noise reaches far beyond it, and
-    truncating the inverse adds more error than it removes. The kernel for a noise :math:`\sigma` is the one of least cost
-    among those of :func:`~kornia_tidy.reconstruction.wiener_kernels.wiener_kernels` for :math:`\sigma` and all larger
+    truncating the inverse adds more error than it removes. The kernel for a noise :math:`\sigma` has the least cost of
+    those of :func:`~kornia_tidy.reconstruction.wiener_kernels.wiener_kernels` for :math:`\sigma` and all larger
     noises. The cost of a kernel k is
 
     .. math:: \int S \, \big\langle |1 - K H|^2 \big\rangle \, df + \sigma^2 \lVert k \rVert_2^2 .
