@@ -109,7 +109,13 @@ def in_metres(psi: float, optics: TiDyOptics) -> str:
 
 
 def channel_names(optics: TiDyOptics) -> list[str]:
-    """Return the names of the channels: a wavelength, or a colour if a channel has several."""
+    """Return the names of the channels: a wavelength, or a colour if a channel has several.
+
+    Example:
+        >>> from kornia_tidy.optics import camera_spectrum
+        >>> [channel_names(TiDyOptics(fidelity="draft", spectrum=s)) for s in (None, camera_spectrum())]
+        [['610 nm', '530 nm', '470 nm'], ['red', 'green', 'blue']]
+    """
     seen = [
         [wavelength for wavelength, weight in zip(optics.spectrum.wavelengths, weights, strict=True) if weight]
         for weights in optics.spectrum.weights

@@ -71,6 +71,9 @@ class TestLinearCamera(BaseTester):
             for move in (lambda a, x: a(x), lambda a, x: a.adjoint(x)):
                 one_by_one = torch.cat([move(a, x) for a, x in zip(alone, image[:, None], strict=True)])
                 self.assert_close(move(operator, image), one_by_one, rtol=0, atol=1e-5)
+            seen = image.clone().requires_grad_()
+            (slope,) = torch.autograd.grad(operator.adjoint(seen).square().sum() / 2, seen)
+            self.assert_close(slope, operator(operator.adjoint(image)), rtol=0, atol=1e-5)
         with pytest.raises(ValueError, match="one place, or one for each of 2 images, got 3"):
             LinearCamera(optics, depth, field_center=[(0.0, 0.0)] * 3)
         with pytest.raises(ValueError, match="one place, or one for each of 1 images, got 2"):
