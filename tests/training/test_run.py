@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from tests.base import BaseTester
 
 pytest.importorskip("lightning.pytorch")
 
+from kornia_tidy.training.callbacks import WriteLog
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
 from kornia_tidy.training.run import train
@@ -56,6 +58,16 @@ class TestTrain(BaseTester):
         names = {path.name for path in (tmp_path / "pictures").iterdir()}
         assert {"epoch_0001_masks.png", "epoch_0001_psfs.png", "epoch_0001_estimates.png"} <= names
         assert list((tmp_path / "tensorboard").glob("events.*"))
+
+    def test_feature_the_log_has_the_seconds_of_a_step(self, tmp_path, monkeypatch):
+        moments = iter([0.0, 3.0, 3.0, 5.0, 5.0])
+        monkeypatch.setattr("kornia_tidy.training.callbacks.time", SimpleNamespace(perf_counter=lambda: next(moments)))
+        trainer = SimpleNamespace(global_step=0, is_global_zero=True, current_epoch=0, callback_metrics={"loss": 1.0})
+        log = WriteLog(tmp_path, every=2)
+        log.on_train_start(trainer, None)
+        for trainer.global_step in (2, 4):
+            log.on_train_batch_end(trainer)
+        assert [row["seconds_a_step"] for row in rows(tmp_path / "training.csv")] == ["1.5", "1.0"]
 
     def test_exception_a_second_run_in_the_folder_of_one_at_work(self, tmp_path):
         with only_here(tmp_path, "a training is at work"):
