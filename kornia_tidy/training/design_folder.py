@@ -9,7 +9,7 @@ from typing import Any
 
 from kornia_tidy.design.candidates import FLAT
 from kornia_tidy.design.design_report import CAMERA, DATA
-from kornia_tidy.files import read_json
+from kornia_tidy.files import error_prefix, read_json
 from kornia_tidy.modulator.modulator import DwellTimes
 from kornia_tidy.psf.camera_settings import settings_of
 
@@ -27,12 +27,12 @@ def designed_settings(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if the folder holds no report of a design.
-        ValueError: if the report is damaged, or the masks are shown by a modulator with switching, levels or losses,
-            which trained systems do not have.
+        ValueError: if the report is damaged, or of a real lens, or of masks that are shown by a modulator with
+            switching, levels or losses, which trained systems do not have.
     """
     path = Path(folder) / DATA
     report = read_json(path)
-    try:
+    with error_prefix(f"cannot read {path}: it is no report of kornia-tidy design, or is damaged", KeyError, TypeError):
         task, camera = report["task"], report["recommended"]
         flat, modulator = camera["start"] == FLAT, task["modulator"]
         near, far = task["depth_range"]
@@ -47,8 +47,11 @@ def designed_settings(folder: str | os.PathLike[str]) -> dict[str, Any]:
             "mask_size": task["mask_size"],
             "reference_f_number": float(task["reference_f_number"]),
         }
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {path}: it is no report of kornia-tidy design, or is damaged") from error
+    if lens := task.get("lens"):
+        raise ValueError(
+            f"{folder} has cameras behind the lens {lens}, and a trained system has an ideal lens: design "
+            f"without --lens"
+        )
     if not flat and modulator != settings_of(DwellTimes()):
         raise ValueError(
             f"the masks of {folder} were designed for a modulator with switching, levels or losses, and a trained "

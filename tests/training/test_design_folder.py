@@ -62,6 +62,11 @@ class TestDesignedSettings(BaseTester):
             designed_settings(folder_of_design(tmp_path / "a", 1.5, slow))
         assert designed_settings(folder_of_design(tmp_path / "b", -1.5, slow))["masks"] == 1
 
+    def test_exception_a_real_lens_that_trained_systems_do_not_have(self, tmp_path):
+        behind = DesignTask(masks=2, lens="double-gauss-50mm")
+        with pytest.raises(ValueError, match="behind the lens double-gauss-50mm, and a trained system has an ideal"):
+            designed_settings(folder_of_design(tmp_path / "a", 1.5, behind))
+
     @pytest.mark.parametrize("change", [{"task": 3}, {"recommended": {}}, {"recommended": None}])
     def test_exception_a_damaged_report(self, change, tmp_path):
         path = folder_of_design(tmp_path / "a", 1.5) / "report.json"
