@@ -40,9 +40,8 @@ _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
 _OFFSET, _DENSITY = 1.0, 6.0
 COLOR_SPACES = ("srgb", "linear")
 _ARGUMENTS = (
-    *("focus_distance", "f_number", "focal_length", "pixel_pitch", "max_radius"),
-    *("compositing", "color_space"),
-)
+    "focus_distance", "f_number", "focal_length", "pixel_pitch", "max_radius", "compositing", "color_space",
+)  # fmt: skip
 
 
 def blur_radius(

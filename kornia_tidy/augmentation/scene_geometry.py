@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 import kornia.augmentation as K
 import torch
 from kornia.augmentation.container.base import ImageSequentialBase
+from kornia.constants import DataKey
 from torch import Tensor, nn
 
 from kornia_tidy.augmentation.depth_augmentation import DepthAugmentation, DepthTap, container_leaves, moves_pixels
@@ -15,7 +16,7 @@ from kornia_tidy.checks import check_float_tensor, check_values
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.psf.field import check_centers
 
-KNOWN = tuple(K.container.augment.DataKey.__members__)
+KNOWN = tuple(DataKey.__members__)
 _DEPTH, _VALID = "mask_of_depth", "mask_of_valid_depth"
 
 
@@ -74,7 +75,7 @@ class SceneGeometry(nn.Module):
                     f"{type(leaf).__name__}"
                 )
         for module in (part for augmentation in augmentations for part in augmentation.modules()):
-            resample = getattr(module, "extra_args", {}).get(K.container.augment.DataKey.MASK, {}).get("resample")
+            resample = getattr(module, "extra_args", {}).get(DataKey.MASK, {}).get("resample")
             if resample is not None and resample.name != "NEAREST":
                 raise ValueError(f"depth must be resampled by the nearest pixel, got extra_args with {resample.name}")
         self.container = K.AugmentationSequential(*cast("Any", augmentations), data_keys=None)

@@ -92,7 +92,7 @@ class FileLens:
     def glass(self, where: str, name: str, makers: Sequence[str] = ()) -> str:
         """Return the name of a glass, whose index is that of the file or of the catalogues of some makers."""
         if name not in self.indices:
-            with error_prefix(f"{where}"):
+            with error_prefix(where):
                 self.indices[name] = catalogue_glass(name, makers)
         return name
 
