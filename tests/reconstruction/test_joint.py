@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from kornia_tidy.reconstruction import AttentionUNet, JointHead
+from kornia_tidy.reconstruction import AttentionUNet, JointHead, UncertainJointEstimate
 from tests.base import BaseTester
 from tests.reconstruction.test_head import SeeingHead
 
@@ -21,6 +21,7 @@ class TestJointHead(BaseTester):
         maps = torch.zeros(2, 6, 8, 8)
         maps[:, :3] = torch.tensor([2.0, 1.0, 1.0]).log().view(3, 1, 1)  # not negative, as a capture is
         estimate = JointHead(SeeingHead(6, 6))(maps)
+        assert isinstance(estimate, UncertainJointEstimate)
         assert torch.equal(estimate.image, maps[:, 3:])
         self.assert_close(estimate.depth, torch.full((2, 1, 8, 8), 0.375))
         self.assert_close(estimate.deviation.square(), torch.full((2, 1, 8, 8), 0.0625 + 0.25 - 0.375**2))
