@@ -121,6 +121,5 @@ class TestRender(BaseTester):
     def test_exception_a_rank_that_is_no_number(self, monkeypatch, tmp_path, refused):
         monkeypatch.setenv("RANK", "first")
         assert "RANK in the environment must be a whole number, got 'first'" in refused([*RENDER, "-o", str(tmp_path)])
-        monkeypatch.setenv("RANK", "2")
-        monkeypatch.setenv("WORLD_SIZE", "2")
-        assert "RANK in the environment must be below WORLD_SIZE, 2, got 2" in refused(["render", "-o", str(tmp_path)])
+        monkeypatch.setenv("RANK", "1")
+        assert "RANK in the environment must be below WORLD_SIZE, 1, got 1" in refused(["render", "-o", str(tmp_path)])
