@@ -123,6 +123,7 @@ class LayeredSceneTester(SceneOperatorTester):
             ("plane", lambda x: x[0, 0], ValueError, r"plane must have four dimensions, .*, got \([0-9]+, [0-9]+\)"),
             ("psfs", lambda x: x[..., :2, :2], ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
             ("psfs", lambda x: x[:, :1], ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
+            ("psfs", lambda x: x[..., 2:, :], ValueError, r"psfs must have shape \(D, 2, P, P\) with P odd, got"),
             ("layer_index", lambda x: x[..., 1:], ValueError, "layer_index must have shape .*, got"),
             ("layer_weight", lambda x: x.repeat(3, 1, 1), ValueError, "layer_weight must have shape .*, got"),
         ],
