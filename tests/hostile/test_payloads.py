@@ -68,6 +68,7 @@ class TestPayloads(BaseTester):
                 assert result != "failed", (name, case.source.name, said)
                 assert not any((tmp_path / "marker").iterdir()), (name, case.source.name)
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("argv", COMMANDS, ids=lambda argv: " ".join(argv[:2]))
     def test_exception_no_command_runs_a_file(self, argv, tmp_path):
         (tmp_path / "marker").mkdir()

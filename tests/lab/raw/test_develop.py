@@ -15,7 +15,7 @@ from kornia_tidy.lab.raw.color import assumed_camera_to_srgb, camera_to_srgb
 from kornia_tidy.lab.raw.develop import balance_factors, default_method, develop, srgb_matrix
 from tests.base import BaseTester, shared
 from tests.lab.raw.dng import XTRANS
-from tests.lab.raw.test_capture import README
+from tests.lab.raw.test_capture import README, a_third
 from tests.lab.raw.test_color import G1, G2
 
 LINEAR = {
@@ -59,7 +59,7 @@ def capture(letters="RGGB", levels=(300, 500, 500, 800), size=4, **more):
 
 
 class TestDevelop(BaseTester):
-    @pytest.mark.parametrize("name", HALVES)
+    @pytest.mark.parametrize("name", a_third(HALVES))
     def test_feature_levels_balance_and_matrix_are_those_of_libraw(self, name):
         """On 2x2 planes, LibRaw's at half size, linear: within 1e-4 everywhere, 3e-5 on average for each channel.
 
