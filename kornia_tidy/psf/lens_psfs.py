@@ -19,11 +19,12 @@ from kornia_tidy.optics.lens.field_table import defocus_terms
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.lens.lens_table import LensTable, degree_of, modes_of
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrature
-from kornia_tidy.optics.quadrature import gauss_legendre_order
+from kornia_tidy.optics.quadrature import band_limited_quadrature
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
 from kornia_tidy.psf.scattered_transform import scattered_energies, scattered_grid
 
+_FEWEST = 4  # points along a patch, for its amplitude and its edges
 _LONGEST = 8.0  # radians from the middle of a patch to its edge; longer phases are cut into more patches
 _BEYOND = 1.5  # times the lens's range; PSFs within it may be interpolated
 _GRID = 21  # points along the stop at which the steepest phase is looked for
@@ -302,16 +303,16 @@ def _mirrored(values: Tensor, mirror: tuple[bool, bool]) -> Tensor:
 def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:
     """Return the open stop cell by cell, as finely as the phase asks, which changes by so much over half a cell."""
     parts = max(1, math.ceil(half / _LONGEST))
-    order = max(4, gauss_legendre_order(half / parts, tolerance))
     discs = tuple(map(tuple, turned.discs().tolist()))
-    return _stop_points(tuple(map(tuple, spans.tolist())), parts, order, discs, turned.degree, turned.shift)
+    asked = half / parts, tolerance
+    return _stop_points(tuple(map(tuple, spans.tolist())), parts, asked, discs, turned.degree, turned.shift)
 
 
 @lru_cache(maxsize=8)
 def _stop_points(
     spans: tuple[tuple[float, ...], ...],
     parts: int,
-    order: int,
+    asked: tuple[float, float],
     discs: tuple[tuple[float, ...], ...],
     degree: int,
     shift: tuple[float, float],
@@ -321,7 +322,7 @@ def _stop_points(
         steps = np.arange(parts + 1) / parts
         edges = begin[:, None] + (end - begin)[:, None] * steps
         fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
-        points = stop_quadrature(fine, order, np.array(discs), shift)
+        points = stop_quadrature(fine, band_limited_quadrature(*asked, _FEWEST), np.array(discs), shift)
         points = StopQuadrature(points.row // parts, points.column // parts, points.x, points.y, points.weight)
         count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
         polynomials = zernike_polynomials(max(count, smooth), points.y, points.x)

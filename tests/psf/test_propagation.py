@@ -12,6 +12,7 @@ from scipy.integrate import quad
 from scipy.special import j1
 
 from kornia_tidy.optics import circular_aperture
+from kornia_tidy.optics.quadrature import band_limited_quadrature
 from kornia_tidy.psf.energies import pixel_energies
 from kornia_tidy.psf.propagation import (
     cell_integrals,
@@ -40,6 +41,24 @@ class TestGaussLegendre(BaseTester):
             b = torch.linspace(0, half_range, 101, dtype=torch.float64)
             mean = (torch.cos(2 * b[:, None] * nodes) * weights).sum(-1)
             assert float((mean - torch.sinc(b / math.pi)).abs().max()) <= 2 * tolerance
+
+    @pytest.mark.parametrize("half_range", [0.0, 0.5, 3.0, 8.0, 40.0])
+    def test_feature_spread_nodes_integrate_waves_within_the_tolerance(self, half_range):
+        for tolerance in (1e-2, 1e-3, 1e-9):
+            nodes, weights = band_limited_quadrature(half_range, tolerance)
+            b = np.linspace(0, half_range, 101)
+            mean = np.exp(1j * b[:, None] * nodes) @ weights / 2
+            assert np.abs(mean - np.sinc(b / math.pi)).max() <= 2 * tolerance
+            assert len(nodes) <= gauss_legendre_order(half_range, tolerance)
+
+    def test_feature_fewer_spread_nodes_are_enough(self):
+        assert [len(band_limited_quadrature(half, 1e-3)[0]) for half in (3.0, 4.5, 7.0)] == [4, 4, 5]
+        assert [gauss_legendre_order(half, 1e-3) for half in (3.0, 4.5, 7.0)] == [4, 5, 7]
+        assert len(band_limited_quadrature(0.0, 1e-3, 4)[0]) == 4
+
+    def test_exception_a_phase_must_be_finite(self):
+        with pytest.raises(ValueError, match="a phase across an interval must be finite radians, got nan"):
+            band_limited_quadrature(math.nan, 1e-3)
 
     def test_feature_one_point_is_enough_for_a_constant(self):
         assert gauss_legendre_order(0.0, 1e-9) == 1

@@ -14,6 +14,7 @@ from kornia_tidy.optics.lens.rays import Array
 from kornia_tidy.optics.zernike import zernike_polynomials
 
 _TOUCH = 1e-12  # stop radii
+_NEAR = 0.25  # lengths of an interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +36,21 @@ class StopQuadrature:
     weight: Tensor
 
 
-def stop_quadrature(spans: Array, order: int, discs: Array, shift: tuple[float, float] = (0.0, 0.0)) -> StopQuadrature:
+def stop_quadrature(
+    spans: Array, rule: tuple[Array, Array], discs: Array, shift: tuple[float, float] = (0.0, 0.0)
+) -> StopQuadrature:
     """Return the quadrature of cells cut by discs.
 
     Args:
         spans: begin and end of the cells along either axis, (2, n) in stop radii.
-        order: Gauss-Legendre points along a side of a patch.
+        rule: nodes on [-1, 1] along a side of a patch, and their weights, which sum to two.
         discs: centres x, y and radius of the discs that light must pass, (E, 3) in stop radii.
         shift: y and x by which the cells lie before their spans, in stop radii.
 
     Example:
         >>> edges = np.linspace(-1.15, 1.15, 24)
-        >>> points = stop_quadrature(np.stack([edges[:-1], edges[1:]]), 6, np.array([[0.0, 0.0, 1.0]]))
+        >>> spans, rule = np.stack([edges[:-1], edges[1:]]), np.polynomial.legendre.leggauss(6)
+        >>> points = stop_quadrature(spans, rule, np.array([[0.0, 0.0, 1.0]]))
         >>> bool((points.weight.sum() - torch.pi).abs() < 1e-6)
         True
     """
@@ -61,11 +65,10 @@ def stop_quadrature(spans: Array, order: int, discs: Array, shift: tuple[float, 
         near = np.maximum(0, np.maximum(box[0] - x, x - box[1])), np.maximum(0, np.maximum(box[2] - y, y - box[3]))
         whole &= np.hypot(*ahead) <= radius
         keep &= np.hypot(*near) < radius - _TOUCH
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    inner = _patches(box[:, whole], nodes, weights)
+    inner = _patches(box[:, whole], *rule)
     cut = np.flatnonzero(keep & ~whole)
     owner, intervals = _intervals(box[:, cut], discs)
-    outer = _cut_patches(box[:, cut][:, owner], intervals, discs, nodes, weights)
+    outer = _cut_patches(box[:, cut][:, owner], intervals, discs, *rule)
     index = np.concatenate([np.flatnonzero(whole), cut[owner]])
     x, y, weight = (torch.from_numpy(np.concatenate(pair)) for pair in zip(inner, outer, strict=True))
     lit = (weight > 0).any(1)
@@ -75,11 +78,11 @@ def stop_quadrature(spans: Array, order: int, discs: Array, shift: tuple[float, 
 
 def light_through_stop(sample: LensSample) -> Tensor:
     """Return the area of direction cosines that the open stop fills, (F, D), up to a factor of the lens."""
-    found = []
+    found, rule = [], np.polynomial.legendre.leggauss(10)
     for f in range(len(sample.radial)):
         edges = sample.edges[f].numpy()
         discs = np.concatenate([[[0.0, 0.0, 1.0]], np.stack([edges[:, 0], 0 * edges[:, 0], edges[:, 1]], 1)])
-        points = stop_quadrature(np.array([[-1.0, -0.5, 0.0, 0.5], [-0.5, 0.0, 0.5, 1.0]]), 10, discs)
+        points = stop_quadrature(np.array([[-1.0, -0.5, 0.0, 0.5], [-0.5, 0.0, 0.5, 1.0]]), rule, discs)
         parts = []
         for coefficients in (sample.amplitude[f], sample.illumination[f]):
             count = coefficients.shape[-1]
@@ -130,11 +133,16 @@ def _crossings(one: Array, other: Array) -> list[float]:
 def _cut_patches(
     box: Array, intervals: Array, discs: Array, nodes: Array, weights: Array
 ) -> tuple[Array, Array, Array]:
-    """Return x, y and weight of the points of cut cells; the root at the end of an arc is smoothed by a sine."""
-    begin, end = intervals[:, :, None]
-    half, turn = (end - begin) / 2, np.pi / 2 * nodes
-    x = (begin + end) / 2 + half * np.sin(turn)
-    across = half * np.cos(turn) * np.pi / 2 * weights
+    """Return x, y and weight of the points of cut cells.
+
+    An arc ends in a root at the first and the last x of its disc. Where that is near, a sine smooths it.
+    """
+    begin, end = intervals
+    roots = np.concatenate([discs[:, 0] - discs[:, 2], discs[:, 0] + discs[:, 2]])[:, None]
+    near = (np.maximum(begin - roots, roots - end) < _NEAR * (end - begin)).any(0)[:, None]
+    begin, end, turn = begin[:, None], end[:, None], np.pi / 2 * nodes
+    x = (begin + end) / 2 + (end - begin) / 2 * np.where(near, np.sin(turn), nodes)
+    across = (end - begin) / 2 * np.where(near, np.cos(turn) * np.pi / 2, 1.0) * weights
     low, high = np.broadcast_to(box[2][:, None], x.shape), np.broadcast_to(box[3][:, None], x.shape)
     for centre, y, radius in discs:
         arc = np.sqrt(np.maximum(radius**2 - (x - centre) ** 2, 0))
