@@ -60,8 +60,8 @@ def band_limited_quadrature(half_range: float, tolerance: float, fewest: int = 1
     Raises:
         ValueError: if ``half_range`` is NaN or infinite.
 
-    Source: Kosloff and Tal-Ezer, J. Comput. Phys. 104, 457 (1993); Hale and Trefethen, SIAM J. Numer. Anal. 46, 930
-    (2008).
+    Source: Kosloff and Tal-Ezer, J. Comput. Phys. 104, 457 (1993); Hale and Trefethen, SIAM Journal on Numerical
+    Analysis 46, 930 (2008).
 
     Example:
         >>> gauss_legendre_order(7.0, 1e-3), len(band_limited_quadrature(7.0, 1e-3)[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -145,10 +145,9 @@ def lens_psfs(
         seen = [turned[images[own[0]].index] for own in members]
         mirrors = [images[i][1:] for i in members[0]]
         stops = [_stop(seen[0], screen.spans, half, sensor.tolerance) for screen in screens]
-        for e, mirror in enumerate(mirrors):
-            light, area = _light(seen, stops[-1], _mirrored(transmission, mirror))
-            light = torch.where(light == 0, 1, light)  # where the rims cut all that the aperture leaves open it is dark
-            for own, *found in zip(members, light.to(weights), area.to(weights), strict=True):
+        for e, (light, area) in enumerate(_light(seen, stops[-1], [_mirrored(transmission, m) for m in mirrors])):
+            lit = torch.where(light == 0, 1, light)  # where the rims cut all that the aperture leaves open it is dark
+            for own, *found in zip(members, lit.to(weights), area.to(weights), strict=True):
                 passed[own[e]], areas[own[e]] = found
         waves = torch.stack([torch.cat([_mirrored(s.waves, m).flatten(1) for s in screens], 1) for m in mirrors])
         cells = torch.cat(
@@ -191,7 +190,7 @@ def lens_light(spans: Tensor, transmission: Tensor, turned: Sequence[TurnedLens]
     areas = [torch.empty(0)] * len(turned)
     for members in _alike(turned, [Image(i, down=False, right=False) for i in range(len(turned))]):
         seen = [turned[i] for (i,) in members]
-        found = _light(seen, _stop(seen[0], spans, 0.0, tolerance), transmission)[1]
+        ((_, found),) = _light(seen, _stop(seen[0], spans, 0.0, tolerance), [transmission])
         for (i,), area in zip(members, found, strict=True):
             areas[i] = area
     return torch.stack(areas)
@@ -357,10 +356,11 @@ def _projection(degree: int) -> tuple[Tensor, Tensor]:
         return polynomials, (polynomials * share).T
 
 
-def _light(turned: Sequence[TurnedLens], stop: Stop, transmission: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the object's light that passes the stop, and the area of cosines that it fills, (F, D) each."""
+def _light(
+    turned: Sequence[TurnedLens], stop: Stop, transmissions: Sequence[Tensor]
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield the object's light that passes each mask, and the area of cosines that it fills, (F, D) each."""
     first = turned[0]
-    passing = stop.moments @ transmission[stop.points.row, stop.points.column]  # of each polynomial
     polynomials, series = _projection(max(first.degree, _SMOOTH))
     count = _count(first.degree)
 
@@ -370,7 +370,9 @@ def _light(turned: Sequence[TurnedLens], stop: Stop, transmission: Tensor) -> tu
 
     light = over_depths("illumination", polynomials[:count])
     ratio = over_depths("amplitude", polynomials[:count]).square() / light
-    return over_depths("illumination", passing[:count, None])[..., 0], (ratio * (series @ passing)).sum(-1)
+    for transmission in transmissions:
+        passing = stop.moments @ transmission[stop.points.row, stop.points.column]  # of each polynomial
+        yield over_depths("illumination", passing[:count, None])[..., 0], (ratio * (series @ passing)).sum(-1)
 
 
 def _rows(turned: Sequence[TurnedLens], stretch: float, middle: float) -> Tensor:

@@ -26,7 +26,7 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.scattered_ops import SOURCE, Points, Transform, scattered_light, scattered_light_by_torch
 from kornia_tidy.mode import Mode, torch_mode
 
-_SIGMA = 1.3  # period of the transform over the window: light beyond it folds back outside the used part
+_SIGMA = 1.2  # period of the transform over the window: light beyond it folds back outside the used part
 _DENSITY = 1.15  # samples of the intensity over those that its bandwidth needs
 _DIM = 0.2  # power of the tolerance
 _NODES = 96
@@ -100,7 +100,7 @@ def scattered_grid(highest: float, window: int, tolerance: float, shift: float =
     Example:
         >>> grid = scattered_grid(0.3, 9, 1e-3)
         >>> grid.extent, grid.cosines.shape, grid.sums(9, torch.zeros(2, 1)).shape
-        (23, torch.Size([10, 12]), torch.Size([2, 1, 9, 28]))
+        (21, torch.Size([9, 11]), torch.Size([2, 1, 9, 28]))
     """
     span = max(2 * highest, 1e-3)
     width = max(3, math.ceil(-math.log10(tolerance) * _WIDTH))

@@ -29,7 +29,6 @@ from kornia_tidy.render.over_field import render_over_field
 from tests.benchmarks.lens_ratio import LENS, least_times
 
 PIXELS = 24  # that are compared
-CELL = 160  # px, near the side of DeepLens's cells in a picture of a megapixel
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -38,13 +37,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, nargs="?", default=Path(), help="of a checkout of DeepLens")
     parser.add_argument("--size", type=int, nargs=2, default=(1110, 1282), help="rows and columns (1110 1282)")
     parser.add_argument("--window", type=int, default=23, help="side of the PSFs in pixels (23)")
+    parser.add_argument("--cell", type=int, default=160, help="side of DeepLens's cells in pixels (160)")
     parser.add_argument("--rounds", type=int, default=3, help="of which the least time counts (3)")
     args = parser.parse_args(arguments)
     source = args.folder / "deeplens" / "imgsim" / "psf.py"
     if not source.is_file():
         sys.exit(f"{source}: no such file: clone github.com/vccimaging/DeepLens and name its folder")
     torch.set_num_threads(1)
-    compare(_function(source), tuple(args.size), args.window, args.rounds)
+    compare(_function(source), tuple(args.size), args.window, args.cell, args.rounds)
 
 
 def _function(source: Path) -> Callable[..., Tensor]:
@@ -57,7 +57,7 @@ def _function(source: Path) -> Callable[..., Tensor]:
 
 
 @torch.no_grad()
-def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, rounds: int) -> None:
+def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, cell: int, rounds: int) -> None:
     """Print times and largest and mean errors of both ways."""
     image, depth = (part[None] for part in dead_leaves(*size, num_leaves=size[0] * size[1] // 3000))
     masks = PixelwiseMask(5, generator=torch.Generator().manual_seed(3))
@@ -66,7 +66,7 @@ def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, r
     field = optics.psf_model.field_of(size)
     assert field is not None
     bank = optics.psf_model.scene_bank(3, image.dtype, psi, field=field)
-    grid = tuple(max(1, round(side / CELL)) for side in size)
+    grid = tuple(max(1, round(side / cell)) for side in size)
     middles = [[(2 * i + 1) * side / (2 * n) - 0.5 for i in range(n)] for side, n in zip(size, grid, strict=True)]
     cells = torch.stack([bank.between(field, (y, x)).psfs for y in middles[0] for x in middles[1]])
     given = -1 / (psi - bank.defocus[0] + 1), cells.unflatten(0, grid), -1 / (bank.defocus - bank.defocus[0] + 1)

@@ -76,7 +76,7 @@ def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) ->
     times.append(least_times(1 if compositing == "occlusion" else rounds, learning))
     with torch.no_grad():
         times.append(least_times(rounds, [lambda: ideal(image, depth), lambda: real(image, depth)]))
-        times.append(least_times(1, [lambda: camera(None)(image, depth), lambda: camera(LENS)(image, depth)]))
+        times.append(least_times(rounds, [lambda: camera(None)(image, depth), lambda: camera(LENS)(image, depth)]))
     return [f"{field.nodes[0]}x{field.nodes[1]}", *(f"{after / before:.2f}" for before, after in times)]
 
 
