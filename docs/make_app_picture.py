@@ -16,6 +16,7 @@ from playwright.sync_api import sync_playwright
 
 PICTURE = Path(__file__).parent / "images" / "app.png"
 WAIT = 300_000  # milliseconds
+WITHOUT_TIME = "text => { text.textContent = text.textContent.replace(/ Computed in .*/, '') }"
 SCALE = 0.75  # pixels of the picture for one of the page
 
 
@@ -38,6 +39,7 @@ def main() -> None:
             page.goto(address)
             page.locator("#picture-psfs img").wait_for()
             page.wait_for_load_state("networkidle")
+            page.get_by_text("Computed in").evaluate(WITHOUT_TIME)  # that of this machine, while it takes the picture
             page.screenshot(path=options.output)
         finally:
             app.send_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ from torch import Tensor
 from kornia_tidy.cli.app.capture import Result
 from kornia_tidy.figures.depth import depth_bar
 from kornia_tidy.figures.explained import MOST_ROWS, draw_masks_and_psfs
-from kornia_tidy.figures.style import DEPTH_COLORS, new_figure
+from kornia_tidy.figures.style import DEPTH_COLORS, INK, new_figure
 from kornia_tidy.optics.thin_lens import ThinLensCamera
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ Picture = NDArray[np.uint8]
 DOTS_PER_INCH, DEPTH_WIDTH = 200, 3.2  # a depth map is 640 pixels wide
 BAR, BELOW = 0.09, 0.34  # inches: height of the colour bar, room for it and its labels
 WIDTH, CELL, HEAD = 5.6, 0.67, 0.55  # inches of the table of masks and PSFs, its rows, and above and below them
+TITLE = 0.4  # inches of its title, at whose right a browser puts buttons
 
 
 def photograph(image: Tensor) -> Picture:
@@ -58,8 +59,11 @@ def masks_and_psfs(result: Result) -> Picture:
         ImportError: if matplotlib is missing.
     """
     masks = len(result.optics.masks.phase)
-    figure = _figure(WIDTH, CELL * (min(masks, MOST_ROWS) + (masks > 1)) + HEAD, DOTS_PER_INCH)
-    figure.subplots_adjust(0.01, 0.06, 0.99, 1)
+    height = CELL * (min(masks, MOST_ROWS) + (masks > 1)) + HEAD + TITLE
+    figure = _figure(WIDTH, height, DOTS_PER_INCH)
+    figure.subplots_adjust(0.01, 0.06, 0.99, 1 - TITLE / height)
+    words = "Masks, and their PSFs over depth" if masks > 1 else "The mask, and its PSFs over depth"
+    figure.text(0.02, 1 - TITLE / 2 / height, words, size=10, weight="bold", color=INK, va="center")
     draw_masks_and_psfs(figure, result.optics, result.camera)
     return _pixels(figure)
 
