@@ -108,7 +108,7 @@ class TestWriteDepth(BaseTester):
     def test_feature_pfm_keeps_every_bit_and_infinity(self, tmp_path):
         depth = torch.rand(1, 6, 9) + 0.1
         depth[0, 0, 0] = INF
-        write_depth(tmp_path / "a.pfm", depth)
+        write_depth(tmp_path / "a.pfm", depth.requires_grad_())
         assert torch.equal(read_depth(tmp_path / "a.pfm").depth, depth)
 
     @pytest.mark.parametrize("scale", [0.001, 0.0002])

@@ -227,10 +227,15 @@ def _summed(values: np.ndarray, step: int) -> np.ndarray:
 
 
 def _from_24_bits(block: np.ndarray, order: str) -> np.ndarray:
-    """Return floating-point numbers of 24 bits (a sign, 7 of the exponent, 16 of the fraction) as float32."""
+    """Return floating-point numbers of 24 bits (a sign, 7 of the exponent, 16 of the fraction) as float32.
+
+    Example:
+        >>> _from_24_bits(np.array([[0x7F, 0, 1], [0xC0, 0x80, 0]], np.uint8), ">")
+        array([nan, -3.], dtype=float32)
+    """
     high, middle, low = np.moveaxis(block if order == ">" else block[..., ::-1], -1, 0).astype(np.uint32)
     exponent, fraction = high & 127, middle << 8 | low
     bits = np.where(exponent == 127, 255, exponent + 64) << 23 | fraction << 7
     values = bits.astype(np.uint32).view(np.float32)
     tiny = fraction.astype(np.float32) * np.float32(2.0**-78)  # subnormal: the exponent is that of 1
-    return np.where(exponent == 0, tiny, values) * np.where(high & 128, np.float32(-1), np.float32(1))
+    return np.copysign(np.where(exponent == 0, tiny, values), np.where(high & 128, np.float32(-1), np.float32(1)))
