@@ -185,7 +185,7 @@ def lagrange(count: int, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         ([[0.25, 0.75]], [[-0.5, 0.5]], [[0.0, 0.0]])
     """
     value, first, second = _series(count)
-    at = torch.from_numpy(np.polynomial.chebyshev.chebvander(places.double().cpu().numpy(), max(count - 1, 1)))
+    at = torch.from_numpy(np.polynomial.chebyshev.chebvander(places.double().tolist(), max(count - 1, 1)))
     return at[:, :count] @ value, at[:, : len(first)] @ first, at[:, : len(second)] @ second
 
 

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_tidy.mode import Mode, torch_mode
+
 CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that its light was at least so much
 # The excess is LEVEL + AMONG u + BESIDE m - BY_NOISE s: u is the share of clipped pixels near by, m by how much the
 # known ones fall short of full scale, s the noise, which lifts pixels to full scale too. The first three by regression
@@ -37,7 +39,7 @@ def beyond_full_scale(light: Tensor, noise: Tensor | float) -> Tensor:
         (True, True)
     """
     clipped = (light - 1).abs() <= 1 - CLIPPED
-    if not clipped.any():
+    if Mode.GRAPH not in torch_mode() and not clipped.any():
         return light
     known = (~clipped).to(light)
     share = _near(known, WIDER)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.render.borders import from_spectrum, pad_border, to_spectrum
 
 STEP = 4  # pixels of the output along a side that one strided convolution computes together
@@ -16,7 +17,7 @@ def convolve_kernels(image: Tensor, kernels: Tensor) -> Tensor:
 
     .. math:: z_{dc} = k_{dc} * x_c
 
-    Compiled and exported graphs have no complex numbers: there :math:`s^2` neighbouring pixels are computed by one
+    Compiled and exported graphs have no complex numbers, and ``torch.vmap`` shows no values: there :math:`s^2` neighbouring pixels are computed by one
     convolution of stride s with shifted copies of the kernels, as a matrix product that is large enough to be fast.
 
     Args:
@@ -37,7 +38,7 @@ def convolve_kernels(image: Tensor, kernels: Tensor) -> Tensor:
     """
     radius = kernels.shape[-1] // 2
     padded = pad_border(image, radius, "reflect" if radius < min(image.shape[-2:]) else "replicate")
-    if torch.compiler.is_compiling():
+    if Mode.GRAPH in torch_mode():
         return _strided(padded, kernels, (image.shape[-2], image.shape[-1]))
     window = kernels.shape[-1]
     unknown = padded.isnan()

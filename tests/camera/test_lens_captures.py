@@ -54,6 +54,22 @@ PIXELS = [(0, 0), (35, 50), (63, 64), (71, 99), (20, 81)]
 
 
 class TestLensCaptures(BaseTester):
+    def test_feature_gradients_of_torch_func_are_those_of_autograd(self):
+        """Of a picture of a size that no capture had before, whose nodes are found within the transform."""
+        optics, (image, depth) = camera(), scene(41, 43)
+        phases = {"masks.phase": optics.masks.get_parameter("phase")}
+
+        def light(phases):
+            return torch.func.functional_call(optics, phases, (image, depth)).square().mean()
+
+        found = torch.func.grad(light)({name: phase.detach() for name, phase in phases.items()})["masks.phase"]
+        self.assert_close(
+            found,
+            torch.autograd.grad(light(phases), phases["masks.phase"])[0],
+            rtol=0,
+            atol=1e-3 * float(found.abs().max()),
+        )
+
     @pytest.mark.parametrize(
         ("compositing", "border", "mask_shift"),
         [*(("gather", border, 0.0) for border in BORDERS), ("occlusion", "zero", 0.0), ("gather", "zero", 22.0)],

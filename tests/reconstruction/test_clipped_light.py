@@ -75,3 +75,9 @@ def test_a_closed_form_rings_less_beside_clipped_light(monkeypatch: pytest.Monke
     filled = error()
     monkeypatch.setattr(ruled_closed_form, "beyond_full_scale", lambda light, noise: light)
     assert filled < 0.8 * error()
+
+
+def test_a_picture_under_vmap_is_restored_as_one_of_a_batch() -> None:
+    light = blurred(torch.cat([blob(2.5), blob(0.9)])).clamp(max=1)
+    found = torch.vmap(lambda one: beyond_full_scale(one[None], NOISE)[0])(light)
+    torch.testing.assert_close(found, beyond_full_scale(light, NOISE))

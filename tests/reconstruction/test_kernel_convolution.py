@@ -21,12 +21,16 @@ class TestConvolveKernels(BaseTester):
         image = torch.rand(2, 3, 11, 14, device=device, dtype=precise)
         assert convolve_kernels(image, kernels(dtype=precise).to(device)).dtype == precise
 
-    @pytest.mark.parametrize("way", ["transform", "strided"])
+    @pytest.mark.parametrize("way", ["transform", "compiled", "vmap"])
     @pytest.mark.parametrize("size", [(12, 16), (11, 9), (2, 13), (1, 1)])
     def test_feature_convolves_each_channel_with_its_kernels(self, way, size):
-        """By SciPy. A graph that is traced has the strided convolution."""
+        """By SciPy. A graph that is traced, and vmap, have the strided convolution."""
         image, taps = torch.rand(2, 3, *size, dtype=torch.float64), kernels()
-        function = convolve_kernels if way == "transform" else torch.compile(convolve_kernels, backend="eager")
+        function = {
+            "transform": convolve_kernels,
+            "compiled": torch.compile(convolve_kernels, backend="eager"),
+            "vmap": torch.vmap(lambda one, taps: convolve_kernels(one[None], taps)[0], in_dims=(0, None)),
+        }[way]
         found = function(image, taps)
         assert found.shape == (2, 2, 3, *size)
         mode = "reflect" if min(size) > 2 else "edge"
