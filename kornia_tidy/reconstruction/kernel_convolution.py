@@ -17,8 +17,9 @@ def convolve_kernels(image: Tensor, kernels: Tensor) -> Tensor:
 
     .. math:: z_{dc} = k_{dc} * x_c
 
-    Compiled and exported graphs have no complex numbers, and ``torch.vmap`` shows no values: there :math:`s^2` neighbouring pixels are computed by one
-    convolution of stride s with shifted copies of the kernels, as a matrix product that is large enough to be fast.
+    Compiled and exported graphs have no complex numbers, and ``torch.vmap`` shows no values. There :math:`s^2`
+    neighbouring pixels are computed by one convolution of stride s with shifted copies of the kernels, as a matrix
+    product that is large enough to be fast.
 
     Args:
         image: (B, C, H, W), float32 or float64.
