@@ -230,8 +230,11 @@ class TestReconstructTiled(BaseTester):
             reconstruct_tiled(head, image, memory_budget=10000)
 
     def test_feature_a_head_is_remembered_only_while_it_lives(self):
-        head = SmallUNet().eval()
-        reconstruct_tiled(head, torch.rand(1, 3, 50, 50), tile=48)
+        head, image, seen, tiles = SmallUNet().eval(), torch.rand(1, 3, 50, 50), [], []
+        reconstruct_tiled(head, image, tile=48)
+        head.first.register_forward_hook(lambda *_: seen.append(1))
+        reconstruct_tiled(head, image, tile=48, progress=lambda _, of: tiles.append(of))
+        assert len(seen) == len(tiles)  # its reach was measured before
         alive = weakref.ref(head)
         del head
         assert alive() is None
