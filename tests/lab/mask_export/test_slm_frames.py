@@ -46,6 +46,7 @@ class TestSLMFrames(BaseTester):
         frames = SLMFrames.of(heights, GreyLevels(8), wavelength=600e-9)
         assert frames.grey.tolist() == [[[0, 1, 21, 255, 0, 255]]]
         assert frames.turns.tolist() == [[[0, 0, 0, 0, 1, -1]]]
+        assert frames.in_words().endswith(", 33.3% of the pixels wrapped by whole waves")
         assert (frames.bits, frames.background) == (8, 0)
 
     @settings(max_examples=80)
