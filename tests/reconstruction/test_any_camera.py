@@ -7,7 +7,7 @@ import torch
 
 from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import AnyCameraHead
-from kornia_tidy.reconstruction.any_camera import MOST, largest_share
+from kornia_tidy.reconstruction.any_camera import MOST, beside_clipped, largest_share
 from tests.base import BaseTester
 from tests.reconstruction.test_closed_form import bank, photo
 
@@ -48,6 +48,17 @@ class TestAnyCameraHead(BaseTester):
         self.assert_close(found[0], restored.image)
         self.assert_close(found[1], restored.image + correction)
         assert correction.abs().max() > 1e-3
+
+    def test_feature_the_share_rises_beside_clipped_pixels_alone(self):
+        capture = torch.full((1, 3, 16, 64), 0.5)
+        capture[:, 1, :, 40:] = 1.0
+        share = beside_clipped(torch.full((1, 1, 1, 1), 0.3), capture)
+        assert share.shape == (1, 1, 16, 64)
+        self.assert_close(share[..., :32], torch.full((1, 1, 16, 32), 0.3))
+        assert (share[..., 36:44].diff() >= 0).all()
+        assert 0.6 < float(share[..., 39].mean()) < float(share.max()) <= MOST
+        whole = torch.full((1, 1, 1, 1), MOST)
+        self.assert_close(beside_clipped(whole, capture), whole.expand_as(share))  # which is the most there is
 
     def test_feature_the_less_there_is_to_correct_the_smaller_is_the_share(self):
         """Noise of a thousandth, and of a tenth, behind PSFs that hardly blur."""

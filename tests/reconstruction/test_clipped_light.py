@@ -43,9 +43,10 @@ def test_light_that_is_not_clipped_stays() -> None:
     assert float(((found - seen) != 0).float().mean()) < 1e-3
 
 
-def test_white_that_noise_lifts_to_full_scale_stays_near_it() -> None:
-    noise = NOISE * torch.randn(1, 3, 96, 96, generator=torch.Generator().manual_seed(0))
-    found = beyond_full_scale((1 + noise).clamp(0, 1), NOISE)
+@pytest.mark.parametrize("deviation", [NOISE, 0.012, 0.03])
+def test_white_that_noise_lifts_to_full_scale_stays_near_it(deviation: float) -> None:
+    noise = deviation * torch.randn(1, 3, 96, 96, generator=torch.Generator().manual_seed(0))
+    found = beyond_full_scale((1 + noise).clamp(0, 1), deviation)
     assert abs(float(found.mean()) - 1) < 0.02
 
 

@@ -14,7 +14,13 @@ from torch import Tensor
 from kornia_tidy import SensorNoise
 from kornia_tidy.files import write_bytes
 from kornia_tidy.reconstruction import RuledClosedForm
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead, any_camera_head, corrected, largest_share
+from kornia_tidy.reconstruction.any_camera import (
+    AnyCameraHead,
+    any_camera_head,
+    beside_clipped,
+    corrected,
+    largest_share,
+)
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.metrics import psnr
@@ -95,7 +101,8 @@ def score_networks(name: str, scenes: list[BenchScene], networks: Mapping[str, t
     for scene, electrons, light, noise in own.captures(scenes):
         capture = linear_rgb_to_rgb(light)
         chosen = own.form.settings_of(capture, noise)
-        restored, largest = own.form.restore_by(capture, chosen), largest_share(own.form, chosen)
+        restored = own.form.restore_by(capture, chosen)
+        largest = beside_clipped(largest_share(own.form, chosen), capture)
         images = {"rule": restored.image}
         images |= {key: corrected(restored.image, net(restored.maps), largest) for key, net in networks.items()}
         if head is not None:
