@@ -1,8 +1,7 @@
-"""Which share of mutants the tests catch: ``python -m tests.code_mutants --count 300 --seed 0 --commit HEAD``.
+"""Which share of mutants the tests catch: ``python -m tests.code_mutants --set heart --count 300 --commit HEAD``.
 
-A commit is exported, its quick tests are run once to see which functions each calls, then each
-mutant meets the tests that call its function. Results are kept as lines of JSON: a run goes on
-where it stopped.
+A commit is exported, its quick tests are run once to see which functions each calls, then each mutant meets the tests
+that call its function. Results are kept as lines of JSON: a run goes on where it stopped.
 """
 
 from __future__ import annotations
