@@ -317,15 +317,18 @@ class TestLensPSFs(BaseTester):
 
 @pytest.mark.takes_seconds
 class TestAgainstReference(BaseTester):
-    """PSFs by Huygens sums over an independent tracer's rays: every field, depth and colour, masked and bare."""
+    """PSFs by Huygens sums over an independent tracer's rays: every field, depth and colour, masked and bare.
+
+    The samples of a PSF are within .0024 of finer ones, so that bare lenses have 3e-3 and not their fits' 1e-3 or less.
+    """
 
     @pytest.mark.parametrize(
         ("file", "name", "f_number", "masked", "bare"),
         [
-            ("single_f17.6", "single-50mm", 17.6, 4e-3, 2e-3),
+            ("single_f17.6", "single-50mm", 17.6, 4e-3, 3e-3),
             ("double_gauss_f17.6", "double-gauss-50mm", 17.6, 6e-3, 3e-3),
-            ("double_gauss_f8.0", "double-gauss-50mm", 8.0, 3e-3, 2e-3),
-            ("triplet_f8.0", "triplet-50mm", 8.0, 3e-3, 2e-3),
+            ("double_gauss_f8.0", "double-gauss-50mm", 8.0, 3e-3, 3e-3),
+            ("triplet_f8.0", "triplet-50mm", 8.0, 3e-3, 3e-3),
             ("phone_f5.6", "phone-5.5mm", 5.6, 1e-2, 1e-2),
         ],
     )
