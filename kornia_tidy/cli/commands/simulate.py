@@ -59,7 +59,7 @@ class Simulate:
 
         Through a real lens, from a file of an optical program:
           kornia-tidy simulate rgb.png --depth depth.png --depth-scale 0.001 --lens lens.zmx \
-              --f-number 8 --focus-distance 1.5
+              --f-number 8 --focus-distance 1.5 --fidelity draft
     """
 
     image: Annotated[str, Argument("IMAGE")]
