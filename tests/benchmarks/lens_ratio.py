@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) -> list[str]:
     """Return the number of places over the field, and times over those of the ideal lens in words."""
     image, depth = (part[None] for part in dead_leaves(*size, num_leaves=size[0] * size[1] // 3000))
-    field_center = 554.5 - size[0] / 2, 640.5 - size[1] / 2  # a crop of the corner of 1110 x 1282 px
+    field_center = 555 - size[0] / 2, 641 - size[1] / 2  # a crop of the corner of 1110 x 1282 px
 
     def camera(lens: str | None) -> TiDyOptics:
         masks, fidelity = PixelwiseMask(5, generator=torch.Generator().manual_seed(3)), Fidelity(window=window)
