@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from kornia_tidy.files import check_file, parse_json, read_bytes
+from kornia_tidy.files import error_prefix, parse_json, read_bytes
 
 LONGEST_HEADER = 1 << 24  # bytes
 
@@ -40,49 +39,32 @@ def read_tensors(
         ...     read_tensors(f"{folder}/a.safetensors")
         ({'phase': tensor([1., 1.])}, {'of': 'a mask'})
     """
-    path = check_file(path)
-    try:
-        _check_header(path)
-        with safe_open(path, framework="pt") as file:  # compares the header with the length, before anything is read
-            header = dict(file.metadata() or {})
-        # Not get_tensor: safetensors 0.8 keeps two integers for each tensor that it reads.
-        found = load(read_bytes(path))
-        return {name: found.pop(name).clone().to(device) for name in sorted(found)}, header
-    except (SafetensorError, AttributeError, KeyError, TypeError) as error:  # KeyError: a data type that PyTorch lacks
-        raise ValueError(f"cannot read {path}: it is no {what} or is damaged: {error!s:.300}") from None
+    tensors, header = parse_tensors(read_bytes(path), f"cannot read {path}: it is no {what} or is damaged")
+    return {name: tensors.pop(name).to(device) for name in list(tensors)}, header
 
 
-def parse_tensors(data: bytes, what: str = "safetensors file") -> tuple[dict[str, Tensor], dict[str, str]]:
+def parse_tensors(
+    data: bytes, fault: str = "it is no safetensors file or is damaged"
+) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return tensors by name and the metadata of a safetensors file that is in memory. See :func:`read_tensors`.
 
     Args:
         data: bytes of the file.
-        what: description of it, for the message.
+        fault: beginning of the message.
 
     Raises:
-        ValueError: if it is damaged, or its header is longer than 16 MiB.
+        ValueError: if it is damaged, or its header is longer than 16 MiB, which may be of so many tensors that they
+            take gigabytes.
 
     Example:
         >>> from safetensors.torch import save
         >>> parse_tensors(save({"phase": torch.ones(2)}, {"of": "a mask"}))
         ({'phase': tensor([1., 1.])}, {'of': 'a mask'})
     """
-    try:
+    with error_prefix(fault, SafetensorError, AttributeError, KeyError, TypeError):  # KeyError: an unknown data type
         length = int.from_bytes(data[:8], "little")
-        if len(data) < 8 or length > LONGEST_HEADER:
-            raise SafetensorError(f"its header must have at most {LONGEST_HEADER} bytes, got {length}")
-        found = load(data)
+        if length > LONGEST_HEADER:
+            raise ValueError(f"its header must have at most {LONGEST_HEADER} bytes, got {length}")
+        found = load(data)  # not safe_open's get_tensor: safetensors 0.8 keeps two integers for each tensor it reads
         header = parse_json(data[8 : 8 + length]).get("__metadata__") or {}
         return {name: found.pop(name).clone() for name in sorted(found)}, header
-    except (SafetensorError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"cannot read {what}: it is damaged: {error!s:.300}") from None
-
-
-def _check_header(path: Path) -> None:
-    """Raise ``SafetensorError`` for an empty file, or a header of so many tensors that they take gigabytes."""
-    with path.open("rb") as file:
-        start = file.read(8)
-    if not start:
-        raise SafetensorError("the file is empty")
-    if (length := int.from_bytes(start, "little")) > LONGEST_HEADER:
-        raise SafetensorError(f"its header must have at most {LONGEST_HEADER} bytes, got {length}")

@@ -75,9 +75,8 @@ def fit(
     from kornia_tidy.training.module import TidyTraining  # noqa: PLC0415
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
-    module = TidyTraining(
-        optics, network, settings.task, lr=budget.lr, lr_metres=budget.lr_metres, schedule=budget.schedule, ema=0
-    )
+    rates = {"lr": budget.lr, "lr_metres": budget.lr_metres, "schedule": budget.schedule}
+    module = TidyTraining(optics, network, task=settings.task, ema=0, **rates)
     scenes = ForCamera(painted(budget, "train", budget.scenes), cast("ThinLensCamera", optics.camera))
     callbacks = []
     if before_step is not None:

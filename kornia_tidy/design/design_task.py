@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import check_metres, check_part, check_positive
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS, SceneStatistics
-from kornia_tidy.design.settings import LARGEST_MASK, MOST_MASKS, DesignSettings
+from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.modulator.modulator import DwellTimes, timeline_of
@@ -23,6 +23,7 @@ from kornia_tidy.optics.thin_lens import FASTEST, FOCAL_LENGTHS, PITCHES, ThinLe
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.sensor.exposure import exposed_sensor, full_well_of
 from kornia_tidy.sensor.sensor import SensorNoise
+from kornia_tidy.settings import check_settings
 
 SLOWEST_LENS = 2.0  # the best f-number of a plain lens below which nothing is out of focus to speak of
 _PLACES = 3  # over the field of a real lens
@@ -56,6 +57,7 @@ class DesignTask(DesignSettings):
     statistics: SceneStatistics = PHOTOGRAPHS
 
     def __post_init__(self) -> None:
+        check_settings(self)
         if self.lens is not None:
             own = named_focal_length(self.lens)
             if self.focal_length not in (DesignSettings.focal_length, own):
@@ -68,13 +70,7 @@ class DesignTask(DesignSettings):
         check_metres("pixel_pitch", self.pixel_pitch, *PITCHES, "8 um is 8e-6")
         check_part("modulator", self.modulator, nn.Module, "a modulator such as DwellTimes()")
         check_part("statistics", self.statistics, SceneStatistics, "SceneStatistics such as PHOTOGRAPHS")
-        if not isinstance(self.masks, int) or not 1 <= self.masks <= MOST_MASKS:
-            raise ValueError(f"masks must be a whole number from 1 to {MOST_MASKS}, got {self.masks}")
-        if not isinstance(self.mask_size, int) or not 1 <= self.mask_size <= LARGEST_MASK:
-            raise ValueError(f"mask_size must be a whole number from 1 to {LARGEST_MASK}, got {self.mask_size}")
         timeline_of(self.modulator, torch.zeros(self.masks, self.mask_size, self.mask_size))  # refuses other counts
-        if not 0 <= self.depth_weight <= 1:
-            raise ValueError(f"depth_weight must be from 0 (only the image) to 1 (only depth), got {self.depth_weight}")
         if self.full_well is not None:
             check_positive("full_well", self.full_well)
         self.sensor(self.reference_f_number)  # refuses light and noise out of range

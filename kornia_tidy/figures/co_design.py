@@ -16,7 +16,6 @@ from kornia_tidy.figures.style import (
     INK,
     LABEL,
     PHASE_COLORS,
-    SMALL,
     TITLE,
     new_figure,
     open_chart,
@@ -71,12 +70,10 @@ def _search(axes: Axes, design: CoDesign) -> None:
             label = start if start == FLAT else f"masks, {start}"
             stops = [one.f_number for one in own]
             axes.plot(stops, values, linestyle="", marker=marker, markersize=4.5, color=color, label=label)
-    axes.set_yscale("log")
     _f_numbers(axes, [one.f_number for one in design.candidates])
-    axes.set_title("Search: " + ("depth error" if by_depth else "restoration error"), fontsize=TITLE, color=INK)
-    axes.set_ylabel("of the range" if by_depth else "relative to a uniform image", fontsize=LABEL, color=INK)
-    open_chart(axes, LABEL)
-    axes.legend(fontsize=SMALL, frameon=False)
+    title = "Search: " + ("depth error" if by_depth else "restoration error")
+    unit = "of the range" if by_depth else "relative to a uniform image"
+    open_chart(axes, LABEL, yscale="log", title=title, ylabel=unit)
 
 
 def _scores(axes: Axes, design: CoDesign) -> None:
@@ -89,25 +86,17 @@ def _scores(axes: Axes, design: CoDesign) -> None:
     axes.errorbar([coded.candidate.f_number], [coded.score], [error], color=ACCENT, capsize=3, linewidth=1.2)
     axes.axhline(flat.score, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)))
     _f_numbers(axes, [one.candidate.f_number for one in design.finalists])
-    axes.set_title(
-        f"Simulated captures, {design.verdict.scenes} scenes; bar: two standard errors of the gain",
-        fontsize=TITLE,
-        color=INK,
-    )
-    axes.set_ylabel("mean score after the best closed form, dB", fontsize=LABEL, color=INK)
-    open_chart(axes, LABEL)
-    axes.legend(fontsize=SMALL, frameon=False)
+    title = f"Simulated captures, {design.verdict.scenes} scenes; bar: two standard errors of the gain"
+    open_chart(axes, LABEL, title=title, ylabel="mean score after the best closed form, dB")
 
 
 def _f_numbers(axes: Axes, f_numbers: list[float]) -> None:
-    axes.set_xscale("log")
     lowest, highest = min(f_numbers) / 1.1, max(f_numbers) * 1.1
     stops = [2 ** (half / 2) for half in range(-2, 21)]
     shown = [stop for stop in stops if lowest <= stop <= highest]
-    axes.set_xlim(lowest, highest)
+    axes.set(xscale="log", xlim=(lowest, highest), xlabel="f-number")
     axes.set_xticks(shown, [f"{stop:.2g}" for stop in shown])
     axes.set_xticks([], minor=True)
-    axes.set_xlabel("f-number", fontsize=LABEL, color=INK)
 
 
 def _masks(figure: Figure, design: CoDesign) -> None:

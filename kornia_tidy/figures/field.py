@@ -97,7 +97,8 @@ def draw_field(measured: FieldMeasures, airy: float) -> Figure:
                 _name_row(row[0], measured, f)
     for axes, chart in zip(below.subplots(1, 3), (_over_field, _over_depth, _over_colour), strict=True):
         chart(axes, measured)
-        _finish(axes)
+        scale = "cycles a pixel; solid: along the field, dashed: across"
+        open_chart(axes, SMALL, xlim=(0, 0.5), ylim=(0, 1.02), xlabel=scale, ylabel="contrast")
     return figure
 
 
@@ -187,15 +188,6 @@ def _pair(axes: Axes, measured: FieldMeasures, at: tuple[int, int, int], color: 
         frequency = torch.linspace(0, 0.5, contrast.shape[-1])
         axes.plot(frequency, contrast[at], color=color, linewidth=1.4, linestyle=dashes, label=label)
         label = "_"
-
-
-def _finish(axes: Axes) -> None:
-    axes.set(xlim=(0, 0.5), ylim=(0, 1.02))
-    axes.title.set(fontsize=LABEL, color=INK)
-    axes.set_xlabel("cycles a pixel; solid: along the field, dashed: across", fontsize=SMALL, color=INK)
-    axes.set_ylabel("contrast", fontsize=SMALL, color=INK)
-    open_chart(axes, SMALL)
-    axes.legend(fontsize=SMALL, frameon=False, loc="best", handlelength=1.2, labelspacing=0.3)
 
 
 def _focus(measured: FieldMeasures) -> int:

@@ -80,14 +80,11 @@ def _drawn(folder: Path, losses: NDArray[np.float64], name: str, decibels: list[
     means = np.array([part.mean(0) for part in parts if len(part)])
     left.plot(means[:, 0], means[:, 1], color=INK, linewidth=1.3)
     left.set_yscale("log" if bool((means[:, 1] > 0).all()) else "linear")  # a loss in decibels is negative
-    left.set_ylabel("training loss", fontsize=LABEL, color=INK)
     plateau = plateau_step(steps, decibels)
     right.plot(steps, decibels, color=BLUE, linewidth=1.3, marker="o", markersize=3)
     right.axvline(plateau, color=ACCENT, linewidth=1, linestyle=(0, (4, 3)))
-    right.set_ylabel(f"{name}, dB", fontsize=LABEL, color=INK)
-    for axes in (left, right):
-        open_chart(axes, LABEL)
-        axes.set_xlabel("step", fontsize=LABEL, color=INK)
+    for axes, what in ((left, "training loss"), (right, f"{name}, dB")):
+        open_chart(axes, LABEL, xlabel="step", ylabel=what)
     figure.text(0.02, 0.92, f"Learning curve: {folder.name}", fontsize=TITLE, color=INK, weight="bold")
     level = f"within {TOLERANCE:g} dB of it at step {plateau:,} of {steps[-1]:,}"
     if plateau == steps[-1] and len(steps) > 1:

@@ -17,9 +17,9 @@ from kornia_tidy.figures.style import (
     LABEL,
     PHASE_COLORS,
     RED,
-    SMALL,
     TITLE,
     new_figure,
+    open_chart,
 )
 from kornia_tidy.lab.calibration.psf.measured_psfs import MeasuredPSFs
 from kornia_tidy.lab.calibration.psf.phase_retrieval import MaskFit
@@ -113,10 +113,8 @@ def _noise_chart(axes: Axes, measured: MeasuredPSFs, fit: MaskFit | None) -> Non
             left = 100 * fit.residual[:, c].cpu()
             axes.plot(measured.bank.defocus.cpu(), left, "s:", color=ink, markersize=3, linewidth=1)
     words = "relative L1, %: noise (solid)" + ("" if fit is None else ",\nleft by the fit (dotted)")
-    axes.set_title(words, fontsize=TITLE, color=INK)
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("defocus ψ, rad", fontsize=LABEL)
-    axes.tick_params(labelsize=SMALL)
+    open_chart(axes, LABEL, title=words, xlabel="defocus ψ, rad")
 
 
 def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
@@ -126,10 +124,9 @@ def _misfit_chart(axes: Axes, measured: MeasuredPSFs) -> None:
         shown = [(n, report.misfit) for n, report in known if (report.rejected is not None) == rejected]
         axes.plot([n for n, _ in shown], [misfit for _, misfit in shown], ".", color=color, markersize=4)
     used = sum(report.rejected is None for report in measured.reports)
-    axes.set_title(f"misfit of point images, 1 is noise;\n{used} of {len(measured.reports)} used", fontsize=TITLE)
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("point image, far to near", fontsize=LABEL)
-    axes.tick_params(labelsize=SMALL)
+    title = f"misfit of point images, 1 is noise;\n{used} of {len(measured.reports)} used"
+    open_chart(axes, LABEL, title=title, xlabel="point image, far to near")
 
 
 def _mask(axes: Axes, fit: MaskFit) -> None:

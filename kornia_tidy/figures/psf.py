@@ -96,12 +96,8 @@ def _transfer(axes: Axes, measured: PSFMeasures) -> None:
         color = colormaps["viridis"](0.9 * index / max(len(measured.depths) - 1, 1))
         axes.plot(frequency, [1, *curve.tolist()], color=color, linewidth=1.4, label=f"{depth}, {_psi(psi)}")
     axes.axhline(0.5, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.set(xlim=(0, 0.5), ylim=(0, 1.02))
-    axes.set_title(f"Contrast (MTF), mean of all directions, {_middle(measured)}", fontsize=LABEL + 1, color=INK)
-    axes.set_xlabel("spatial frequency, cycles a pixel", fontsize=LABEL, color=INK)
-    axes.set_ylabel("contrast", fontsize=LABEL, color=INK)
-    open_chart(axes, SMALL)
-    axes.legend(fontsize=SMALL, frameon=False, loc="upper right")
+    title, scale = f"Contrast (MTF), mean of all directions, {_middle(measured)}", "spatial frequency, cycles a pixel"
+    open_chart(axes, LABEL, xlim=(0, 0.5), ylim=(0, 1.02), title=title, xlabel=scale, ylabel="contrast")
 
 
 def _psi(defocus: float) -> str:

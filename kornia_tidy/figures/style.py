@@ -64,8 +64,19 @@ def quiet(axes: Axes, spines: bool = True) -> None:
         spine.set(linewidth=0.5, color=FAINT)
 
 
-def open_chart(axes: Axes, label_size: float) -> None:
-    """Style a chart with a faint grid and without frame at the top and right; ``label_size`` is that of ticks in pt."""
+def open_chart(axes: Axes, label_size: float, **properties: Any) -> None:
+    """Set properties of a chart, and draw it with a faint grid, a legend, and without frame at the top and right.
+
+    Args:
+        axes: with all lines.
+        label_size: of ticks, labels and legend in pt; the title is a point larger.
+        **properties: as ``axes.set`` takes them, such as ``title`` and ``xlabel``.
+    """
+    axes.set(**properties)
+    for text, larger in ((axes.title, 1), (axes.xaxis.label, 0), (axes.yaxis.label, 0)):
+        text.set(fontsize=label_size + larger, color=INK)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=label_size, frameon=False)
     axes.grid(which="major", color="#e8ecef", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(which="both", labelsize=label_size, labelcolor=INK, color=FAINT)

@@ -75,13 +75,10 @@ def _label(axes: Axes, words: Sequence[str], rows: Sequence[TradeRow], floor: fl
 
 def _frame(axes: Axes, run: TradeRun, floor: float) -> None:
     times = [1e3 * row.capture_seconds for row in run.rows]
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlim(min(times) / 1.35, max(times) * 1.5)
-    axes.set_ylim(floor / 1.6, 2 * max(2 * floor, *(row.rmse for row in run.rows)))
-    axes.set_xlabel("time of a capture, PSF bank and rendering, ms", fontsize=LABEL, color=INK)
-    axes.set_ylabel("error: RMSE of the noise-free linear capture, full scale 1", fontsize=LABEL, color=INK)
-    open_chart(axes, LABEL)
+    highest = 2 * max(2 * floor, *(row.rmse for row in run.rows))
+    axes.set(xscale="log", yscale="log", xlim=(min(times) / 1.35, max(times) * 1.5), ylim=(floor / 1.6, highest))
+    what = "error: RMSE of the noise-free linear capture, full scale 1"
+    open_chart(axes, LABEL, xlabel="time of a capture, PSF bank and rendering, ms", ylabel=what)
     axes.xaxis.set_major_formatter("{x:g}")
     if any(row.rmse == 0 for row in run.rows):
         axes.axhline(floor, color=FAINT, linewidth=0.6, linestyle=(0, (2, 3)), zorder=1)

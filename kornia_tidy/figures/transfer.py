@@ -51,11 +51,7 @@ def draw_transfer(result: PhotonTransfer) -> Figure:
     for (label, variance), dashes in zip(variances.items(), (":", "--", "-."), strict=True):
         if variance.any():
             axes.plot(gain * levels, gain * np.sqrt(variance), dashes, color=FAINT, linewidth=1, label=label, zorder=1)
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlabel("signal, electrons", fontsize=LABEL, color=INK)
-    axes.set_ylabel("noise, electrons", fontsize=LABEL, color=INK)
-    open_chart(axes, LABEL)
-    axes.legend(fontsize=SMALL, frameon=False, loc="upper left")
+    open_chart(axes, LABEL, xscale="log", yscale="log", xlabel="signal, electrons", ylabel="noise, electrons")
     told = [f"{topic} {text}" for topic, text in result.in_words() if topic in {"levels", "gain", "read", "R²"}]
     figure.suptitle(f"Photon transfer: {result.in_words()[0][1]}", fontsize=TITLE, color=INK, weight="bold")
     axes.set_title("; ".join(told[:2]) + "\n" + "; ".join(told[2:]), fontsize=SMALL, color=FAINT)

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
-from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.psf.camera_settings import EXTRA_STATE
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -21,9 +20,8 @@ from kornia_tidy.reconstruction.depth_distribution import fit_temperature
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.joint_closed_form import JointClosedFormHead
 from kornia_tidy.reconstruction.layered_joint import LayeredJointHead
-from kornia_tidy.reconstruction.losses import mse_loss
 from kornia_tidy.reconstruction.metrics import psnr, rmse
-from kornia_tidy.reconstruction.tasks import MAPS, centre_crop, depth_logits, normalised_inverse_depth, split_maps
+from kornia_tidy.reconstruction.tasks import centre_crop, depth_logits, normalised_inverse_depth, split_maps
 from kornia_tidy.reconstruction.trained import (
     build_head,
     build_optics,
@@ -41,10 +39,11 @@ from kornia_tidy.training.drawn_sensors import SensorEach, with_sensor
 from kornia_tidy.training.noisy_crops import electrons_of, random_sensor
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.scenes import Broken
-from kornia_tidy.training.settings import FIXED_OPTICS, LEARN, SCHEDULES, TrainingSettings, differences
-from kornia_tidy.training.task_loss import LOSSES, Loss, task_loss
+from kornia_tidy.training.settings import TrainingSettings, differences
+from kornia_tidy.training.task_loss import LOSSES, task_loss
 
 STEPPED = "weights_stepped"  # entry of a checkpoint: the number of weights with a state in the optimiser
+BETAS = (0.99, 0.999)  # of Adam, as the paper has them
 HELD_OUT_STEP = 4  # the temperature is fitted to every fourth pixel of every fourth row
 
 
@@ -97,24 +96,12 @@ class TidyTraining(pl.LightningModule):
         head: the network, (B, 3, H, W) to (B, C, H, W): C = 3 for edof, 1 for depth, 4 (depth first) for joint, or
             D + 3 with a distribution of depth over D classes, which is then trained by
             :func:`~kornia_tidy.reconstruction.depth_distribution.distribution_loss`.
-        task: ``"edof"``, ``"depth"`` or ``"joint"``. Depth is estimated as
-            :func:`~kornia_tidy.reconstruction.tasks.normalised_inverse_depth`.
-        loss: function of an estimated map, the true map and the validity mask; the same for all maps.
-        lr: learning rate of the network, and of learnable parameters of the optics other than masks.
-        lr_metres: learning rate of the masks, in metres of height.
-        betas: Adam's.
-        schedule: of both rates: ``"constant"``, or ``"cosine"``, see :func:`cosine_rate`.
-        ema: decay of the moving average of the network's weights, which validation and trained systems use. 0: none.
-        depth_weight: of the depth loss in the joint task.
-        image_weight: of the image loss in the joint task.
-        learn: ``"both"``, or ``"network"``: the optics are fixed, and the network is trained by AdamW with its usual
-            betas, 0.9 and 0.999; or ``"refiner"``: the optics and the network of depth are fixed, and only the second
-            network, for the image, is trained; or ``"masks"``: only they are trained, through a fixed network without
-            training mode or average.
+        settings: those of camera, network and run; checkpoints hold them to rebuild both. None: camera and network were
+            made otherwise, and a checkpoint cannot rebuild them.
         sensors: draws the sensor of each scene by torch's global generator, for a network that knows the level of the
             noise. None: the camera's own.
-        channels_last: keep the channels of a pixel together in the network's memory.
-        settings: the settings of camera and network; checkpoints hold them to rebuild both.
+        **run: settings that differ, such as ``task="joint"`` or ``lr=1e-3``, by the names of
+            :class:`~kornia_tidy.training.settings.TrainingSettings`.
 
     Raises:
         ValueError: if a value is not allowed.
@@ -131,43 +118,26 @@ class TidyTraining(pl.LightningModule):
         self,
         optics: TiDyOptics,
         head: nn.Module,
-        task: str = "edof",
-        loss: Loss = mse_loss,
-        *,
-        lr: float = 1e-4,
-        lr_metres: float = 1e-8,
-        betas: tuple[float, float] = (0.99, 0.999),
-        schedule: str = "constant",
-        ema: float = 0.999,
-        depth_weight: float = 1.0,
-        image_weight: float = 1.0,
-        learn: str = "both",
-        sensors: Callable[[], SensorNoise] | None = None,
-        channels_last: bool = False,
         settings: TrainingSettings | None = None,
+        *,
+        sensors: Callable[[], SensorNoise] | None = None,
+        **run: Any,
     ) -> None:
         super().__init__()
-        check_choice("task", task, tuple(MAPS))
-        check_choice("schedule", schedule, SCHEDULES)
-        check_choice("learn", learn, tuple(LEARN))
-        check_positive("lr", lr)
-        check_positive("lr_metres", lr_metres, "metres")
-        self.fixed_optics = learn in FIXED_OPTICS
-        self.optics = optics.requires_grad_(requires_grad=False) if self.fixed_optics else optics
-        if learn == "refiner":
-            if not isinstance(head, JointClosedFormHead) or head.refiner is None:
-                raise ValueError("learn='refiner' needs a JointClosedFormHead with a refiner")
+        self.run = (TrainingSettings() if settings is None else settings).replace(**run)
+        self.settings = None if settings is None else self.run
+        self.optics = optics.requires_grad_(requires_grad=False) if self.run.fixed_optics else optics
+        refiner = head.refiner if isinstance(head, JointClosedFormHead) else None
+        if self.run.learn == "refiner" and refiner is None:
+            raise ValueError("learn='refiner' needs a JointClosedFormHead with a refiner")
+        if self.run.learn in {"refiner", "masks"}:
             head.requires_grad_(requires_grad=False)
-            head.refiner.requires_grad_()
-        if learn == "masks":
-            head.requires_grad_(requires_grad=False)
-        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        self.head = head.to(memory_format=self.memory_format) if channels_last else head  # ty: ignore[no-matching-overload]
-        self.takes_noise = takes_noise(head)
-        self.average = MovingAverage(head, ema) if ema and learn != "masks" else None
-        self.task, self.loss, self.learn, self.sensors, self.settings = task, loss, learn, sensors, settings
-        self.lr, self.lr_metres, self.betas, self.schedule = lr, lr_metres, betas, schedule
-        self.weights = {"depth": depth_weight, "image": image_weight}
+        if self.run.learn == "refiner" and refiner is not None:
+            refiner.requires_grad_()
+        self.memory_format = torch.channels_last if self.run.channels_last else torch.contiguous_format
+        self.head = head.to(memory_format=self.memory_format) if self.run.channels_last else head  # ty: ignore[no-matching-overload]
+        self.takes_noise, self.sensors = takes_noise(head), sensors
+        self.average = MovingAverage(head, self.run.ema) if self.run.ema and self.run.learn != "masks" else None
         self._held_out: list[tuple[Tensor, ...]] = []  # distributions of depth of validation scenes, with the truth
 
     @classmethod
@@ -193,27 +163,13 @@ class TidyTraining(pl.LightningModule):
             optics.fidelity = optics.fidelity.replace(window=settings.window)
             fix_window(optics)  # for the designed masks
         electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
-        return cls(
-            optics,
-            build_head(settings),
-            settings.task,
-            LOSSES[settings.loss],
-            lr=settings.lr,
-            lr_metres=settings.lr_metres,
-            schedule=settings.schedule,
-            ema=settings.ema,
-            depth_weight=settings.depth_weight,
-            image_weight=settings.image_weight,
-            learn=settings.learn,
-            sensors=partial(random_sensor, settings.noise_range, electrons) if settings.learn == "masks" else None,
-            channels_last=settings.channels_last,
-            settings=settings.replace(window=optics.window),
-        )
+        sensors = partial(random_sensor, settings.noise_range, electrons) if settings.learn == "masks" else None
+        return cls(optics, build_head(settings), settings, sensors=sensors, window=optics.window)
 
     def train(self, mode: bool = True) -> Self:
         """Set the training mode; a network that is not learnt stays in that of evaluation."""
         super().train(mode)
-        if self.learn == "masks":
+        if self.run.learn == "masks":
             self.head.eval()
         return self
 
@@ -226,7 +182,7 @@ class TidyTraining(pl.LightningModule):
                 of the camera's sensor.
         """
         network = self.head if self.training or self.average is None else self.average
-        if not self.fixed_optics:  # else the PSFs are those of on_fit_start
+        if not self.run.fixed_optics:  # else the PSFs are those of on_fit_start
             update_psfs(network, self.optics)
         coded = coded.contiguous(memory_format=self.memory_format)
         return network(coded, noise=noise) if self.takes_noise else network(coded)
@@ -245,7 +201,7 @@ class TidyTraining(pl.LightningModule):
         else:
             coded, truth, mask, noise = self._photograph(batch)
         output = self(coded, noise).float()
-        return BatchResult(coded, split_maps(self.task, output), truth, mask, depth_logits(self.task, output))
+        return BatchResult(coded, split_maps(self.run.task, output), truth, mask, depth_logits(self.run.task, output))
 
     def _photograph(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor], Tensor, Tensor | None]:
         """Return captures, true maps, the mask of known depth and, with ``sensors``, the noise of a batch of scenes."""
@@ -272,7 +228,7 @@ class TidyTraining(pl.LightningModule):
     def training_step(self, batch: dict[str, Any], batch_idx: int) -> Tensor:
         """Return the loss of a batch."""
         result = self.reconstruct(batch)
-        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
+        loss = self._loss(result)
         self.log("loss", loss.detach(), prog_bar=True, batch_size=len(result.coded))
         return loss
 
@@ -282,7 +238,7 @@ class TidyTraining(pl.LightningModule):
         The PSNR is that of the image clipped to [0, 1], as it would be shown.
         """
         result = self.reconstruct(batch)
-        loss = task_loss(self.loss, result.estimate, result.truth, result.mask, self.weights, result.logits)
+        loss = self._loss(result)
         scores = {"val_loss": loss}
         for name, maps in result.estimate.items():
             errors = rmse(maps, result.truth[name], result.mask if name == "depth" else None)
@@ -293,6 +249,10 @@ class TidyTraining(pl.LightningModule):
         if result.logits is not None:
             maps = result.logits, result.truth["depth"], result.mask
             self._held_out.append(tuple(part[..., ::HELD_OUT_STEP, ::HELD_OUT_STEP] for part in maps))
+
+    def _loss(self, result: BatchResult) -> Tensor:
+        weights = {"depth": self.run.depth_weight, "image": self.run.image_weight}
+        return task_loss(LOSSES[self.run.loss], result.estimate, result.truth, result.mask, weights, result.logits)
 
     def on_validation_epoch_start(self) -> None:
         """Begin to collect distributions of depth of the validation scenes, at a temperature of 1."""
@@ -312,18 +272,18 @@ class TidyTraining(pl.LightningModule):
 
     def adam(self) -> torch.optim.Optimizer:
         """Return the optimiser, before its first step: one Adam, with the masks' rate in metres of height."""
-        if self.fixed_optics:
-            return torch.optim.AdamW((weight for weight in self.head.parameters() if weight.requires_grad), lr=self.lr)
-        groups = self.optics.parameter_groups(self.lr_metres, self.lr)
+        if self.run.fixed_optics:
+            return torch.optim.AdamW((w for w in self.head.parameters() if w.requires_grad), lr=self.run.lr)
+        groups = self.optics.parameter_groups(self.run.lr_metres, self.run.lr)
         groups = [group for group in groups if list(group["params"])]  # a fixed lens has none
-        if self.learn == "both":
-            groups.append({"params": list(self.head.parameters()), "lr": self.lr})
-        return torch.optim.Adam(groups, lr=self.lr, betas=self.betas)
+        if self.run.learn == "both":
+            groups.append({"params": list(self.head.parameters()), "lr": self.run.lr})
+        return torch.optim.Adam(groups, lr=self.run.lr, betas=BETAS)
 
     def configure_optimizers(self) -> Any:
         """Return the optimiser, and the schedule of its rates unless they are constant."""
         adam = self.adam()
-        if self.schedule == "constant":
+        if self.run.schedule == "constant":
             return adam
 
         def rate(step: int) -> float:
@@ -336,7 +296,7 @@ class TidyTraining(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Hand the PSFs of fixed optics to the network and its average."""
-        if self.fixed_optics:
+        if self.run.fixed_optics:
             with torch.no_grad():
                 for network in (self.head, self.average):
                     if network is not None:
@@ -360,7 +320,7 @@ class TidyTraining(pl.LightningModule):
         if "optimizer_states" in checkpoint:
             checkpoint[STEPPED] = sum(len(optimiser["state"]) for optimiser in checkpoint["optimizer_states"])
         checkpoint["settings"] = None if self.settings is None else self.settings.as_dict()
-        checkpoint["task"] = self.task
+        checkpoint["task"] = self.run.task
         checkpoint["description"] = describe(self.optics, self.head)
         if psfs := psfs_to_store(self.optics):
             checkpoint["psfs"] = psfs
@@ -371,7 +331,7 @@ class TidyTraining(pl.LightningModule):
         Raises:
             ValueError: if task, camera, network or weights differ; the message names the difference.
         """
-        here = {"task": self.task, **describe(self.optics, self.head)}
+        here = {"task": self.run.task, **describe(self.optics, self.head)}
         stored = {"task": checkpoint.get("task"), **checkpoint.get("description", {})}
         if f"optics.{EXTRA_STATE}" in checkpoint["state_dict"]:  # it holds all of the fidelity, and restores the window
             here["fidelity"] = stored.get("fidelity", "")

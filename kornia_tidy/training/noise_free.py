@@ -16,11 +16,11 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.data.npy import decode_npy, encode_npy
-from kornia_tidy.files import error_prefix, read_bytes, read_json, write_bytes
+from kornia_tidy.files import error_prefix, read_bytes, write_bytes
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.render.repeatable import repeatable
 from kornia_tidy.seeds import keyed_seed
-from kornia_tidy.training.coded_datasets.conditions import camera_digest
+from kornia_tidy.training.coded_datasets.conditions import camera_digest, claim
 from kornia_tidy.training.random_state import seeded
 
 LEVELS = 2**16 - 1  # of stored values: their rounding is 230 times below the least noise in training, 0.001
@@ -82,7 +82,7 @@ class NoiseFreeCaptures(Dataset):
         self.optics.color_space = "linear"
         self.decode = optics.decode
         self.folder.mkdir(parents=True, exist_ok=True)
-        _claim(self.folder / CONDITIONS, conditions)
+        claim(self.folder, json.loads(json.dumps(conditions, default=str)), CONDITIONS)
 
     def __len__(self) -> int:
         """Return the number of scenes."""
@@ -115,17 +115,3 @@ class NoiseFreeCaptures(Dataset):
         inverse_depth = normalised_inverse_depth(self.optics.camera, sample["depth"])
         planes = torch.cat([sample["image"], sample["all_in_focus"], inverse_depth, sample["mask"].float()], 1)[0]
         return (planes.clamp(0, 1) * LEVELS).round().numpy().astype(np.uint16)
-
-
-def _claim(path: Path, conditions: Mapping[str, Any]) -> None:
-    """Write the conditions of the captures, or check that they agree with the written ones."""
-    text = json.dumps(conditions, indent=2, default=str)
-    if not path.exists():
-        write_bytes(path, f"{text}\n".encode())
-        return
-    there, here = read_json(path), json.loads(text)
-    if there != here:
-        other = [name for name in here if not isinstance(there, dict) or there.get(name) != here[name]]
-        raise ValueError(
-            f"{path.parent} holds captures with another {' and another '.join(other)}: choose another folder"
-        )

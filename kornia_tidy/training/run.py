@@ -109,80 +109,52 @@ def train(
     scenes, validation = make_scenes(settings, "train"), make_scenes(settings, "validation")
     folder.mkdir(parents=True, exist_ok=True)
     with only_here(folder, "a training is at work") if _is_first_process() else nullcontext():
-        stored = folder / "captures" if captures is None else Path(captures)
-        return _train(
-            settings, folder, scenes, validation, resume, head_from, refiner_from, masks_from, psfs, stored,
-            save_every, workers, progress, trainer_options,
-        )  # fmt: skip
-
-
-def _train(
-    settings: TrainingSettings,
-    folder: Path,
-    scenes: Dataset[Any],
-    validation: Dataset[Any],
-    resume: bool,
-    head_from: str | os.PathLike[str] | None,
-    refiner_from: str | os.PathLike[str] | None,
-    masks_from: str | os.PathLike[str] | None,
-    psfs: PSFBank | FieldBank | None,
-    captures: Path,
-    save_every: int,
-    workers: int,
-    progress: bool,
-    trainer_options: Mapping[str, Any],
-) -> TidyTraining:
-    """Train in a folder that is locked."""
-    checkpoint = _prepare(folder, settings, resume)
-    stored = None if checkpoint is None else _read_run(checkpoint)
-    if settings.pretrain_epochs and checkpoint is None:
-        first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
-        stage: dict[str, Any] = {
-            "head_from": head_from,
-            "refiner_from": refiner_from,
-            "psfs": psfs,
-            "save_every": save_every,
-            "workers": workers,
-            "progress": progress,
-        }
-        train(first, folder / "pretrain", resume=resume, **stage, **trainer_options)
-        head_from, refiner_from = folder / "pretrain" / LAST, None
-    if checkpoint is not None:  # the window was measured on the masks before training
-        settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
-    pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
-    psfs = psfs if stored is None else _same_psfs(psfs, stored_psfs(stored), checkpoint)
-    module = TidyTraining.from_settings(
-        settings, psfs=psfs, design=checkpoint is None and masks_from is None, progress=progress
-    )
-    assert module.settings is not None
-    if settings.data in PAINTED:
-        module.optics.notes.told.add("depth")  # painted in metres: a far scene does not suggest another unit
-    if masks_from is not None and checkpoint is None:
-        load_masks(masks_from, module.optics)
-        module.optics.fidelity = module.optics.fidelity.replace(window=settings.window)
-        module.settings = module.settings.replace(window=fix_window(module.optics).window)
-    if (head_from is not None or refiner_from is not None) and checkpoint is None:
-        if head_from is not None:
-            _begin_network(head_from, module.head)
-        if refiner_from is not None:
-            _begin_refiner(refiner_from, module.head)
-        if module.average is not None:
-            module.average.network.load_state_dict(module.head.state_dict())
-    module.settings.write(folder / SETTINGS)
-    if settings.fixed_optics:
-        if stored is not None:  # the masks may have been designed
+        checkpoint = _prepare(folder, settings, resume)
+        stored = None if checkpoint is None else _read_run(checkpoint)
+        if settings.pretrain_epochs and stored is None:
+            first = settings.replace(masks=0, pretrain_epochs=0, epochs=settings.pretrain_epochs)
+            train(
+                first, folder / "pretrain", resume=resume, head_from=head_from, refiner_from=refiner_from, psfs=psfs,
+                save_every=save_every, workers=workers, progress=progress, **trainer_options,
+            )  # fmt: skip
+            head_from, refiner_from = folder / "pretrain" / LAST, None
+        if stored is not None:  # the window was measured on the masks before training
+            settings = settings.replace(window=TrainingSettings.read(folder / SETTINGS).window)
+            psfs = _same_psfs(psfs, stored_psfs(stored), checkpoint)
+        pl.seed_everything(keyed_seed(settings.seed, "start") % 2**32, verbose=False)
+        design = stored is None and masks_from is None
+        module = TidyTraining.from_settings(settings, psfs=psfs, design=design, progress=progress)
+        if settings.data in PAINTED:
+            module.optics.notes.told.add("depth")  # painted in metres: a far scene does not suggest another unit
+        if stored is None:
+            _begin(module, settings.window, head_from, refiner_from, masks_from)
+        elif settings.fixed_optics:  # the masks may have been designed
             load_weights(stored, module.optics, name=str(checkpoint))
-        parts = {"train": scenes, "validation": validation}
-        scenes, validation = (_crops(part, parts[part], module, captures / part) for part in parts)
-    data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
+        module.run.write(folder / SETTINGS)
+        if settings.fixed_optics:
+            place = folder / "captures" if captures is None else Path(captures)
+            scenes = _crops("train", scenes, module, place)
+            validation = _crops("validation", validation, module, place)
+        data = SceneData(scenes, validation, settings.batch, settings.seed, settings.augment, workers)
+        with _contained():
+            trainer = _trainer(settings, folder, save_every, progress, trainer_options)
+            if stored is not None:
+                batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
+                with error_prefix(f"cannot resume from {checkpoint}"):
+                    check_stored_run(stored, trainer, module, batches)
+            _fit(trainer, module, data, checkpoint)
+    return module
+
+
+def _trainer(
+    settings: TrainingSettings, folder: Path, save_every: int, progress: bool, options: Mapping[str, Any]
+) -> pl.Trainer:
     callbacks: list[pl.Callback] = [
         WriteLog(folder),
         DrawPictures(folder / "pictures"),
         SaveCheckpoints(folder, save_every, patience=settings.patience),  # last, after the logs
     ]
-    if progress:
-        callbacks.append(pl.callbacks.TQDMProgressBar(leave=False))
-    options: dict[str, Any] = {
+    usual: dict[str, Any] = {
         "max_epochs": settings.epochs,
         "accumulate_grad_batches": settings.accumulate,
         "precision": settings.precision,
@@ -190,26 +162,18 @@ def _train(
         "accelerator": "cpu",
         "devices": 1,
         "log_every_n_steps": 10,
-        **trainer_options,
     }
-    with _contained():
-        trainer = pl.Trainer(
-            plugins=[SafetensorsIO()],
-            callbacks=callbacks,
-            logger=TensorBoardLogger(folder, name="tensorboard", version=""),
-            num_sanity_val_steps=0,
-            use_distributed_sampler=False,
-            enable_checkpointing=False,
-            enable_progress_bar=progress,
-            enable_model_summary=False,
-            **options,
-        )
-        if stored is not None:
-            batches = len(data.train_dataloader()) // trainer.world_size  # not yet divided among processes
-            with error_prefix(f"cannot resume from {checkpoint}"):
-                check_stored_run(stored, trainer, module, batches)
-        _fit(trainer, module, data, checkpoint)
-    return module
+    return pl.Trainer(
+        plugins=[SafetensorsIO()],
+        callbacks=callbacks + ([pl.callbacks.TQDMProgressBar(leave=False)] if progress else []),
+        logger=TensorBoardLogger(folder, name="tensorboard", version=""),
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        enable_checkpointing=False,
+        enable_progress_bar=progress,
+        enable_model_summary=False,
+        **{**usual, **options},
+    )
 
 
 def _read_run(path: Path) -> dict[str, Any]:
@@ -226,6 +190,26 @@ def _same_psfs(
     if given is not None and (stored is None or not torch.equal(given.psfs, stored.psfs)):
         raise ValueError(f"cannot resume from {path}: its PSFs are not those that are given")
     return stored
+
+
+def _begin(
+    module: TidyTraining,
+    window: int | None,
+    head_from: str | os.PathLike[str] | None,
+    refiner_from: str | os.PathLike[str] | None,
+    masks_from: str | os.PathLike[str] | None,
+) -> None:
+    """Load the masks and the weights that a new run begins with; a window of None is measured on the masks."""
+    if masks_from is not None:
+        load_masks(masks_from, module.optics)
+        module.optics.fidelity = module.optics.fidelity.replace(window=window)
+        module.settings = module.run = module.run.replace(window=fix_window(module.optics).window)
+    if head_from is not None:
+        _begin_network(head_from, module.head)
+    if refiner_from is not None:
+        _begin_refiner(refiner_from, module.head)
+    if module.average is not None and (head_from, refiner_from) != (None, None):
+        module.average.network.load_state_dict(module.head.state_dict())
 
 
 def _begin_network(path: str | os.PathLike[str], head: nn.Module) -> None:
@@ -276,24 +260,14 @@ def _as_head(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path) -> NoisyCrops:
     """Return training samples of captures by a module's camera; of validation, whole captures."""
-    settings = module.settings
-    assert settings is not None
+    settings, training = module.run, split == "train"
     about = {"split": split, **{name: getattr(settings, name) for name in SCENE_SETTINGS}}
     if settings.data not in PAINTED:  # of files, the number decides which are drawn
         about["scenes"] = len(cast("Any", scenes))
-    captures = NoiseFreeCaptures(scenes, module.optics, folder, about)
-    training = split == "train"
+    captures = NoiseFreeCaptures(scenes, module.optics, folder / split, about)
     electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
-    crop = settings.crop if training else None
-    return NoisyCrops(
-        captures,
-        module.optics,
-        crop,
-        settings.noise_range,
-        electrons,
-        gain=training,
-        noise_error=settings.noise_error,
-    )
+    light, crop = (settings.noise_range, electrons), settings.crop if training else None
+    return NoisyCrops(captures, module.optics, crop, *light, gain=training, noise_error=settings.noise_error)
 
 
 def _is_first_process() -> bool:

@@ -65,7 +65,7 @@ def check_stored_run(state: Mapping[str, Any], trainer: pl.Trainer, module: Tidy
 
 def _check_schedule(state: Mapping[str, Any], adam: torch.optim.Optimizer, module: TidyTraining) -> None:
     place = "lr_schedulers"
-    schedules = [] if module.schedule == "constant" else [torch.optim.lr_scheduler.LambdaLR(adam, lambda _: 1.0)]
+    schedules = [] if module.run.schedule == "constant" else [torch.optim.lr_scheduler.LambdaLR(adam, lambda _: 1.0)]
     _check(state.get(place, _MISSING), [each.state_dict() for each in schedules], place)
     done = state["loops"]["fit_loop"]["epoch_loop.scheduler_progress"]["total"]["completed"]
     for schedule, stored in zip(schedules, state[place], strict=True):

@@ -25,6 +25,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::lightning.pytorch.utilities.warnings.PossibleUserWarning"),
 ]
 SETTINGS = TrainingSettings(task="joint", masks=2, head="plain", width=4, size=48, window=23, lr=1e-3)
+REFINED = {"depth_classes": 6, "refocus": 2, "closed_form": True, "refined": True, "learn": "refiner"}
 
 
 def made(**changes):
@@ -166,8 +167,7 @@ class TestTidyTraining(BaseTester):
         assert module.head.layers[0].weight.is_contiguous(memory_format=torch.channels_last)
 
     def test_feature_the_refiner_alone_learns_and_depth_stays_as_it_is(self, monkeypatch):
-        refined = {"depth_classes": 6, "refocus": 2, "closed_form": True, "refined": True, "learn": "refiner"}
-        module = made(**refined)
+        module = made(**REFINED)
         (group,) = module.configure_optimizers().param_groups
         assert {id(p) for p in group["params"]} == {id(p) for p in module.head.refiner.parameters()}
         monkeypatch.setattr(module, "log", lambda *args, **options: None)
@@ -213,7 +213,7 @@ class TestTidyTraining(BaseTester):
 
     def test_exception_there_is_no_refiner(self):
         with pytest.raises(ValueError, match="needs a JointClosedFormHead with a refiner"):
-            TidyTraining(build_optics(SETTINGS), nn.Identity(), learn="refiner")
+            TidyTraining(build_optics(SETTINGS), nn.Identity(), SETTINGS, **REFINED)
 
     def test_feature_the_psnr_of_validation_is_that_of_the_clipped_image(self, monkeypatch):
         module, logged = made(task="edof", learn="network").eval(), {}

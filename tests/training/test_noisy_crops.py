@@ -96,9 +96,9 @@ class TestNoiseFreeCaptures(BaseTester):
     def test_exception_captures_of_another_camera_or_of_other_scenes(self, tmp_path):
         NoiseFreeCaptures(Points(), camera(), tmp_path, {"seed": 0})
         NoiseFreeCaptures(Points(), camera(sigma=0.3), tmp_path, {"seed": 0})  # the sensor does not matter
-        with pytest.raises(ValueError, match="holds captures with another camera: choose another folder"):
+        with pytest.raises(ValueError, match=r"holds captures made otherwise \(there / now\): camera"):
             NoiseFreeCaptures(Points(), camera(tilt=1e-7), tmp_path, {"seed": 0})
-        with pytest.raises(ValueError, match="holds captures with another set of scenes: choose another folder"):
+        with pytest.raises(ValueError, match=r"holds captures made otherwise \(there / now\): set of scenes"):
             NoiseFreeCaptures(Points(), camera(), tmp_path, {"seed": 1})
         assert json.loads((tmp_path / "captures.json").read_text())["set of scenes"] == {"seed": 0}
 

@@ -520,4 +520,4 @@ def _state_parts(state: Tensor) -> LensParts:
     what = "the lens in the state"
     if not isinstance(state, Tensor) or state.dtype != torch.uint8:
         raise ValueError(f"{what} must be bytes, got {described(state)}")
-    return lens_parts(*parse_tensors(state.cpu().numpy().tobytes(), what), what)
+    return lens_parts(*parse_tensors(state.cpu().numpy().tobytes(), f"cannot read {what}: it is damaged"), what)

@@ -51,13 +51,13 @@ def conditions(
     return json.loads(json.dumps(standard({**about, "made_from": dict(made_from), **camera}), default=str))
 
 
-def claim(folder: Path, own: Mapping[str, Any]) -> None:
+def claim(folder: Path, own: Mapping[str, Any], name: str = CONDITIONS) -> None:
     """Write the conditions into an empty folder, or check that they agree with those in it.
 
     Raises:
         ValueError: if the folder holds other files or captures; the message names the differences.
     """
-    path = folder / CONDITIONS
+    path = folder / name
     others = any(not other.name.startswith(".") for other in folder.iterdir())
     if not path.exists():  # checked after the other files, as another process writes it before them
         if others:
