@@ -1,4 +1,4 @@
-"""Accuracy: the cheapest fidelity within an error tolerance, predicted without rendering.
+"""Plans of captures: the cheapest fidelity within an error tolerance, predicted without rendering.
 
 A camera, a scene and a tolerance come in; a plan with its predicted error, operations and memory goes out. Read
 ``planner.py`` first; the error model is in ``error_model.py``.

@@ -1,8 +1,9 @@
 """Scenes with depth: readers for image and depth files, data sets, scenes painted at random, and their statistics.
 
-Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first. Depth of your own with
-unknown pixels goes through :func:`fill_holes`. ``scene_statistics.py`` has the power spectrum and light of photographs,
-and how their depths are distributed, for mask design and the Wiener filter.
+Files come in, samples of image, depth and validity mask go out. Read ``scene_dataset.py`` first. Raw files (DNG) are
+read by ``lab/raw/decoder.py``. Depth of your own with unknown pixels goes through :func:`fill_holes`.
+``scene_statistics.py`` has the power spectrum and light of photographs, and how their depths are distributed, for mask
+design and the Wiener filter.
 """
 
 from kornia_tidy.arrays import to_opencv

@@ -1,8 +1,8 @@
 """From a defocus map and a PSF bank to the irradiance on the sensor.
 
-An image in linear light, its defocus and a PSF bank come in; the irradiance on the sensor goes out. Read
-``compositing.py`` first (gather, scatter, occlusion), then ``scene.py`` (the input of a backend) and ``dispatch.py``
-(the choice of a backend).
+An image in linear light, its defocus and a PSF bank (from ``psf/psf_model.py``) come in; the irradiance on the sensor
+goes out. Read ``compositing.py`` first (gather, scatter, occlusion), then ``scene.py`` (the input of a backend) and
+``dispatch.py`` (the choice of a backend).
 """
 
 from kornia_tidy.render.compositing import gather, occlusion, render, scatter

@@ -1,8 +1,8 @@
 """Sensor: converts irradiance to the values that a camera records, with shot, dark and read noise.
 
 A linear-light image in units of full scale comes in. The same image with noise, quantised and clipped, goes out. Read
-``sensor.py`` first; ``steps.py`` has single steps, ``fixed_pattern.py`` the differences between pixels,
-``exposure.py`` the light that an f-number admits.
+``sensor.py`` first, which adds the noise; ``steps.py`` has shot noise and quantisation as functions,
+``fixed_pattern.py`` the differences between pixels, ``exposure.py`` the light that an f-number admits.
 """
 
 from kornia_tidy.sensor.exposure import electrons_at, exposed_sensor, full_well_of
