@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,18 +19,17 @@ from kornia_tidy.checks import (
     check_choice,
     check_depth,
     check_float_tensor,
-    check_metres,
-    check_number,
     check_positive,
 )
 from kornia_tidy.choices import COMPOSITING
 from kornia_tidy.kernels.pixel_ops import decode, encode
 from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.mode import Mode, torch_mode
-from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.aperture import disc_cover
 from kornia_tidy.optics.lens.lens import Lens
-from kornia_tidy.optics.thin_lens import FOCAL_LENGTHS, NEAREST_DEPTH, PITCHES, ThinLensCamera
-from kornia_tidy.optics.units import check_depth_fits, check_image, misread_depth, warn_once
+from kornia_tidy.optics.misread_depth import misread_depth
+from kornia_tidy.optics.thin_lens import NEAREST_DEPTH, ThinLensCamera, check_lens
+from kornia_tidy.optics.units import check_depth_fits, check_image, warn_of_metres, warn_once
 from kornia_tidy.render.compositing import render
 
 _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
@@ -182,14 +180,14 @@ def _check_lens(
     """Raise an error unless these settings are those of a lens."""
     check_choice("color_space", color_space, COLOR_SPACES)
     check_choice("compositing", compositing, COMPOSITING)
-    nearest, fastest = (float(v.detach().min()) if isinstance(v, Tensor) else v for v in (focus_distance, f_number))
-    check_positive("f_number", fastest)
-    check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
-    check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
     check_positive("max_radius", max_radius, "pixels")
-    check_number("focus_distance", nearest, "metres")
-    if not nearest > focal_length:
-        raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {nearest}")
+    tensors = isinstance(focus_distance, Tensor) or isinstance(f_number, Tensor)
+    if tensors and Mode.GRAPH in torch_mode():  # which shows no values
+        return
+    nearest, fastest = (float(v.detach().min()) if isinstance(v, Tensor) else v for v in (focus_distance, f_number))
+    check_lens(focal_length, nearest, fastest, pixel_pitch)
+    last = focal_length**2 / (2 * _SHARP * fastest * pixel_pitch)  # whose disc is a point where infinity is in focus
+    warn_of_metres(["focus_distance"], [nearest], focal_length, last)
 
 
 def disc_layer(radius: Tensor, max_radius: float) -> Tensor:
@@ -232,9 +230,17 @@ def _discs_each_e(max_radius: float) -> float:
     return math.ceil(_DENSITY * logarithm) / logarithm if logarithm else 0.0
 
 
-def _discs(layer: Tensor, channels: int, max_radius: float) -> SimpleNamespace:
+class _Discs(NamedTuple):
+    """Discs as the renderer reads PSFs, (D, C, P, P), around the layers (D,)."""
+
+    psfs: Tensor
+    defocus: Tensor
+    veil: None = None
+
+
+def _discs(layer: Tensor, channels: int, max_radius: float) -> _Discs:
     """Return the discs around the layers of a scene, as the renderer reads PSFs."""
-    if Mode.GRAPH in torch_mode() and not torch.compiler.is_compiling():  # vmap, which shows no values
+    if Mode.GRAPH in torch_mode():  # which shows no values
         last = disc_layer(torch.tensor(max_radius, dtype=torch.float64), max_radius)
         ends = -last, last
     else:
@@ -243,9 +249,10 @@ def _discs(layer: Tensor, channels: int, max_radius: float) -> SimpleNamespace:
     numbers = range(math.floor(first), math.ceil(last) + 1)
     radii = [disc_radius(number, max_radius) for number in numbers]
     side = 2 * math.ceil(round(max(radii), 4)) + 1
-    psfs = torch.stack([disc(radius, side) for radius in radii]).to(layer)
+    made = disc.__wrapped__ if torch.compiler.is_compiling() else disc  # which warns of caches
+    psfs = torch.stack([made(radius, side) for radius in radii]).to(layer)
     nodes = layer.new_tensor(list(numbers))
-    return SimpleNamespace(psfs=psfs[:, None].expand(-1, channels, -1, -1), defocus=nodes, veil=None)
+    return _Discs(psfs[:, None].expand(-1, channels, -1, -1), nodes)
 
 
 @lru_cache(maxsize=1024)
@@ -263,7 +270,7 @@ def disc(radius: float, side: int) -> Tensor:
         >>> disc(0.5, 3)[1, 1], disc(1.5, 3)[1]
         (tensor(1., dtype=torch.float64), tensor([0.1375, 0.1415, 0.1375], dtype=torch.float64))
     """
-    area = circular_aperture(side, 1.0, max(radius, 0.1), edges="area")
+    area = disc_cover(side, 1.0, max(radius, 0.1))
     return area / area.sum()
 
 

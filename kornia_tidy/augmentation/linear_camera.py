@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.camera.holes import fills_holes
+from kornia_tidy.camera.samples import check_defocus
 from kornia_tidy.camera.strips import Strip
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice, check_float_tensor, check_part
@@ -75,7 +76,7 @@ class LinearCamera(nn.Module):
             depth, valid = fill_holes(depth)
         self.register_buffer("depth", depth, persistent=False)
         self.register_buffer("valid", valid, persistent=False)
-        optics.camera.defocus(depth, optics.check_inputs)  # raises
+        check_defocus(optics.camera.defocus(depth, optics.check_inputs), optics)  # raises, and warns
         if field_center is not None and len(depth) > 1:
             check_centers(field_center, len(depth))  # raises; with one depth, places are checked on use
 

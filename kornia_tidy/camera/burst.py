@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from kornia_tidy.camera.samples import read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
+from kornia_tidy.modulator.switching import check_exposure
 from kornia_tidy.sensor.sensor import SensorNoise
 
 
@@ -34,6 +35,7 @@ def burst_shares(shares: Tensor, dead_time: float, exposure: float) -> Tensor:
         >>> burst_shares(torch.full((5,), 0.2), dead_time=5e-3, exposure=0.1)
         tensor([0.1600, 0.1600, 0.1600, 0.1600, 0.1600])
     """
+    check_exposure(exposure)
     lost = (len(shares) - 1) * dead_time
     if not 0 <= lost < exposure:
         raise ValueError(

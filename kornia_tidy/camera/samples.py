@@ -18,8 +18,9 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.precision import widest
 from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
+from kornia_tidy.optics.misread_depth import misread_depth
 from kornia_tidy.optics.thin_lens import DefocusRange
-from kornia_tidy.optics.units import SAME_FOCUS, check_depth_fits, check_image, layout_remedy, misread_depth, warn_once
+from kornia_tidy.optics.units import SAME_FOCUS, check_depth_fits, check_image, layout_remedy, warn_once
 from kornia_tidy.psf.field import check_centers
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped
@@ -326,6 +327,12 @@ def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, 
         if beyond or reach[1] <= lo + SAME_FOCUS:
             warn_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)
     return torch.tensor(reach, requires_grad=defocus.requires_grad)
+
+
+def check_defocus(defocus: Tensor, camera: CheckedCamera) -> None:
+    """Warn once of depths in another unit or beyond the camera's range, from their defocus."""
+    if camera.check_inputs and defocus.numel() and Mode.GRAPH not in torch_mode():
+        warn_of_defocus(torch.stack(torch.aminmax(defocus.detach())), camera)
 
 
 def warn_of_defocus(extremes: Tensor, camera: CheckedCamera, pixels: int = 0, clamped: int = 0) -> None:

@@ -18,12 +18,12 @@ from kornia_tidy.camera.published_systems import published_parts
 from kornia_tidy.camera.samples import (
     Notes,
     Sample,
+    check_defocus,
     check_light,
     compute_dtype,
     defocus_extremes,
     defocus_extremes_in_one_read,
     read_sample,
-    warn_of_defocus,
 )
 from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_positive
@@ -410,6 +410,7 @@ class TiDyOptics(CameraState):
         light = None if image is None else self.decode(sample.image.to(sample.dtype))
         metres = sample.depth.to(compute_dtype(depth.dtype, self.fidelity, depth.device))
         defocus = self.camera.defocus(metres, self.check_inputs)
+        check_defocus(defocus, self)
         return plan_scene(self, defocus, light, (len(sample.image), sample.image.shape[1]), tolerance)
 
     @torch.no_grad()
@@ -490,9 +491,7 @@ class TiDyOptics(CameraState):
     def check_scene(self, image: Tensor, depth: Tensor) -> None:
         """Check the values of an image and its depth as a capture does, and warn of other units."""
         sample = read_sample(image, depth, self)
-        defocus = self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs).detach()
-        if self.check_inputs:
-            warn_of_defocus(torch.stack(torch.aminmax(defocus)), self)
+        check_defocus(self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs), self)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""

@@ -22,6 +22,14 @@ MOST_SAMPLES = 1024  # of a transition; a saved camera could ask for more than m
 SETTLED = 0.99  # fraction of an exponential response that is complete at the end of the switching time
 
 
+def check_exposure(exposure: float) -> None:
+    """Raise an error unless an exposure is positive, and warn once of one that is probably in milliseconds."""
+    check_positive("exposure", exposure, "seconds")
+    if exposure > LONG:
+        said = f"exposure is {exposure:g} s: if these are milliseconds, give {exposure / 1e3:g}"
+        warn_once(None, ("exposure", exposure), said, stacklevel=4)
+
+
 class Switching(Modulator):
     r"""A modulator with a finite switching time: the capture includes the light of the transitions between masks.
 
@@ -96,10 +104,7 @@ class Switching(Modulator):
                 f"switching_time must be zero or positive seconds up to {SLOWEST:g} (4 ms is 4e-3), got "
                 f"{switching_time}"
             )
-        check_positive("exposure", exposure, "seconds")
-        if exposure > LONG:
-            said = f"exposure is {exposure:g} s: if these are milliseconds, give {exposure / 1e3:g}"
-            warn_once(None, ("exposure", exposure), said)
+        check_exposure(exposure)
         check_positive("samples", samples)
         if samples > MOST_SAMPLES:
             raise ValueError(f"samples must be at most {MOST_SAMPLES} points in time for a transition, got {samples}")

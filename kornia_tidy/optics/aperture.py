@@ -181,6 +181,17 @@ def _disc(size: int, pitch: float, radius: float, edges: str) -> Tensor:
     centres = _cell_centres(size, pitch)
     if edges == "binary":
         return (torch.hypot(centres[:, None], centres) <= radius + TOLERANCE).double()
+    return disc_cover(size, pitch, radius)
+
+
+def disc_cover(size: int, pitch: float, radius: float) -> Tensor:
+    """Return the share of each cell's area that a centred disc covers, (size, size) float64.
+
+    Example:
+        >>> disc_cover(3, 1.0, 0.5).sum()  # pi / 4
+        tensor(0.7854, dtype=torch.float64)
+    """
+    centres = _cell_centres(size, pitch)
     corner_areas = _disc_area_up_to(_grid_lines(size, pitch), radius)
     cover = corner_areas.diff(dim=0).diff(dim=1) / pitch**2
     # The differences leave round-off of 1e-16 / pitch², so cells wholly inside or outside are set to 1 or 0.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.optics.spectrum import check_wavelength
 
 Terms = tuple[tuple[float, float], ...]
 
@@ -49,9 +49,9 @@ class Material:
             The index, without unit.
 
         Raises:
-            ValueError: if the wavelength is not positive or outside the published range.
+            ValueError: if the wavelength is not in metres or outside the published range.
         """
-        check_positive("wavelength", wavelength, "metres")
+        check_wavelength("wavelength", wavelength)
         shortest, longest = self.valid
         slack = 1e-9  # 0.45 * 1e-6 and 450e-9 differ in the last digit
         if not shortest * (1 - slack) <= wavelength <= longest * (1 + slack):

@@ -9,13 +9,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_number
 from kornia_tidy.search_path import import_installed
 
 REFERENCE_WAVELENGTH = 530e-9  # m; defocus and mask phase are quoted at this wavelength throughout
 
 SHORTEST, LONGEST = 100e-9, 20e-6  # m; from vacuum ultraviolet to thermal infrared
 VISIBLE = (400e-9, 700e-9)  # m; passband of a camera's filters
+
+
+def check_wavelength(name: str, wavelength: float) -> None:
+    """Raise ``ValueError`` unless a wavelength in metres is between 100 nm and 20 um."""
+    check_number(name, wavelength, "metres")
+    if not SHORTEST <= wavelength <= LONGEST:
+        allowed = f"metres between {SHORTEST:g} and {LONGEST:g} (530 nm is 530e-9)"
+        raise ValueError(f"{name} must be {allowed}, got {wavelength}")
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,7 @@ class Spectrum:
         if not self.wavelengths or not self.weights:
             raise ValueError("a spectrum must have at least one wavelength and one channel, got none")
         for wavelength in self.wavelengths:
-            if not SHORTEST <= wavelength <= LONGEST:
-                allowed = f"metres between {SHORTEST:g} and {LONGEST:g} (530 nm is 530e-9)"
-                raise ValueError(f"wavelengths must be {allowed}, got {wavelength}")
+            check_wavelength("wavelengths", wavelength)
         for channel, row in enumerate(self.weights):
             if len(row) != len(self.wavelengths):
                 raise ValueError(

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from kornia_tidy.checks import check_depth, check_metres, check_number, check_part, check_positive, check_values
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.materials import Material
-from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, check_wavelength
+from kornia_tidy.optics.units import like_infinity, warn_of_metres
 
 FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in air
 # Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
@@ -62,6 +63,19 @@ def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
     if not 0 < near < far:
         raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
     return near, far
+
+
+def check_lens(focal_length: float, focus_distance: float | Tensor, f_number: float | None, pixel_pitch: float) -> None:
+    """Raise ``ValueError`` unless a lens of these lengths and of this f-number can be made."""
+    check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+    check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
+    check_number("focus_distance", focus_distance, "metres")
+    if not (focus := _number(focus_distance)) > focal_length:
+        raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
+    if f_number is not None:
+        check_positive("f_number", f_number)
+        if f_number < FASTEST * (1 - 1e-9):
+            raise ValueError(f"f_number must be at least {FASTEST}, the limit of a lens in air, got {f_number}")
 
 
 def _number(value: float | Tensor) -> float:
@@ -127,19 +141,16 @@ class ThinLensCamera(nn.Module):
         f_number: float | None = None,
     ) -> None:
         super().__init__()
-        check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+        if f_number is not None and aperture_diameter is not None:
+            raise ValueError(
+                f"aperture_diameter or f_number sets the aperture, got both: {aperture_diameter} and {f_number}"
+            )
+        check_lens(focal_length, focus_distance, f_number, pixel_pitch)
         if f_number is not None:
-            if aperture_diameter is not None:
-                raise ValueError(
-                    f"aperture_diameter or f_number sets the aperture, got both: {aperture_diameter} and {f_number}"
-                )
-            check_positive("f_number", f_number)
             aperture_diameter = focal_length / f_number
         elif aperture_diameter is None:
             aperture_diameter = DEFAULT_DIAMETER
         check_metres("aperture_diameter", aperture_diameter, *DIAMETERS, "2.8 mm is 2.8e-3")
-        check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
-        check_number("focus_distance", focus_distance, "metres")
         if focal_length < FASTEST * aperture_diameter * (1 - 1e-9):
             raise ValueError(
                 f"aperture_diameter must be at most {focal_length / FASTEST:g} m, which is f/{FASTEST}, for a focal "
@@ -147,14 +158,11 @@ class ThinLensCamera(nn.Module):
             )
         if lens_material is not None:
             check_part("lens_material", lens_material, Material, "a material such as kornia_tidy.optics.PMMA")
-        focus = _number(focus_distance)
-        if not focus > focal_length:
-            raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
         self.focal_length = focal_length
         self.aperture_diameter = aperture_diameter
         self.pixel_pitch = pixel_pitch
         self.lens_material = lens_material
-        self.focus_distance: float | Tensor = focus
+        self.focus_distance: float | Tensor = (focus := _number(focus_distance))
         if isinstance(focus_distance, Tensor):
             del self.focus_distance  # a parameter may not shadow an attribute
             self.focus_distance = nn.Parameter(focus_distance.detach().clone())
@@ -162,6 +170,8 @@ class ThinLensCamera(nn.Module):
             raise ValueError("a camera focused at infinity needs depth_range=(near, far) in metres, got None")
         near, far = _depth_range(depth_range) if depth_range is not None else (focus / 2, math.inf)
         self.depth_range = (near, far)
+        names, farthest = ("focus_distance", "depth_range"), like_infinity(self.aperture_radius)
+        warn_of_metres(names, (focus, near), focal_length, farthest)
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
         # Plain numbers, so that the defocus nodes of a PSF bank do not move with a learnable focus.
         self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))
@@ -206,6 +216,7 @@ class ThinLensCamera(nn.Module):
             >>> [round(lens.chromatic_defocus(w), 2) for w in (610e-9, 530e-9, 470e-9)]
             [1.8, 0.0, -2.08]
         """
+        check_wavelength("wavelength", wavelength)
         if self.lens_material is None:
             return 0.0
         power = (self.lens_material.index(wavelength) - 1) / (self.lens_material.index(REFERENCE_WAVELENGTH) - 1)

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Hashable
-from typing import TYPE_CHECKING, cast
+from collections.abc import Hashable, Sequence
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.arrays import FARTHEST
-
-if TYPE_CHECKING:
-    from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 
 # Noise and interpolation go a little beyond [0, 1], and no encoding of highlights goes above 2.39 (scRGB).
 # An image normalised by ImageNet's statistics spans -2.12 to 2.64, and an 8-bit image reaches 255.
@@ -21,6 +17,7 @@ BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
 DARKEST_LIGHT = -1.0  # out-of-gamut colours are negative in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
 SAME_FOCUS = 0.5  # rad; lowers the peak of a PSF by only 2 % (1 - psi^2 / 12), so two depths look equally sharp
+LEAST_MILLIMETRES = 100.0  # m; to this distance a setting is taken for metres, as few lenses focus at 100 mm
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"))
 
 _TOLD: set[Hashable] = set()  # warnings that were given in this process
@@ -109,47 +106,44 @@ def check_head_image(image: Tensor) -> str | None:
     return normalised(lowest, highest, DARKEST_CODE)
 
 
-def misread_depth(camera: ThinLensCamera | DefocusRange, lowest: Tensor, highest: Tensor) -> str | None:
-    """Return a warning if depths are probably in millimetres or centimetres instead of metres.
+def like_infinity(aperture_radius: float) -> float:
+    """Return the depth in metres beyond which all depths have one focus, behind a pupil of this radius in metres."""
+    return math.pi * aperture_radius**2 / 530e-9 / SAME_FOCUS
 
-    Three conditions must hold. The nearest pixel is so far that its focus equals that of infinity or of the far end of
-    the camera's range. No pixel is at infinity, as sky is. In the other unit the nearest depth lies in the camera's
-    range.
+
+def misread_metres(name: str, metres: float, first: float, last: float, remedy: str) -> str | None:
+    """Return a warning if a depth lies where a camera sees no difference any more, but not if it were millimetres.
 
     Args:
-        camera: converts depth to defocus.
-        lowest: defocus of the farthest pixel in radians.
-        highest: defocus of the nearest pixel in radians.
-
-    Returns:
-        The warning, or None.
+        name: what is so far away.
+        metres: its distance. Infinity and those beyond 100 km, as of sky, give no warning.
+        first: nearest depth that is plausible, in metres.
+        last: depth in metres beyond which the camera sees no difference.
+        remedy: what to multiply, with a place for the factor.
 
     Example:
-        >>> from kornia_tidy import ThinLensCamera
-        >>> camera = ThinLensCamera()
-        >>> misread_depth(camera, *camera.defocus(torch.tensor([1500.0, 700.0])))
-        'the nearest pixel is 700 m away, where this camera sees no difference from infinity: are these millimetres? \
-Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
-        >>> misread_depth(camera, *camera.defocus(torch.tensor([1.5, 0.7]))) is None
-        True
+        >>> misread_metres("focus_distance", 595.0, 0.05, 24.0, "it by {:g}")
+        'focus_distance is 595 m away, and this camera sees no difference beyond 24 m: are these millimetres? \
+Multiply it by 0.001'
     """
-    if float(highest) > camera.defocus_range[0] + SAME_FOCUS or not hasattr(camera, "depth_range"):
-        return None
-    lens = cast("ThinLensCamera", camera)
-    nearest, farthest = (float(lens.depth(psi).detach()) for psi in (highest, lowest))
-    first, last = lens.depth_range
-    like_infinity = math.pi * lens.aperture_radius**2 / 530e-9 / SAME_FOCUS  # m; beyond, all depths have one focus
-    last = min(last, like_infinity)
-    if nearest <= last or farthest > FARTHEST:
+    if not last < metres <= FARTHEST:
         return None
     for factor, unit in UNITS:
-        if first <= nearest * factor <= last:
-            limit = "infinity" if last == like_infinity else f"{last:.3g} m"
+        if first <= metres * factor <= last:
             return (
-                f"the nearest pixel is {nearest:.4g} m away, where this camera sees no difference from {limit}: are "
-                f"these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
+                f"{name} is {metres:.4g} m away, and this camera sees no difference beyond {last:.3g} m: are these "
+                f"{unit}? Multiply {remedy.format(factor)}"
             )
     return None
+
+
+def warn_of_metres(names: Sequence[str], metres: Sequence[float], first: float, last: float) -> None:
+    """Warn once of the first of some distances that :func:`misread_metres` takes for millimetres."""
+    last = max(last, LEAST_MILLIMETRES)
+    for name, far in zip(names, metres, strict=True):
+        if said := misread_metres(name, far, first, last, "it by {:g}"):
+            warn_once(None, ("metres", name), said, stacklevel=4)
+            return
 
 
 def check_depth_fits(depth: Tensor, image: Tensor) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from kornia_tidy.checks import check_positive
+from kornia_tidy.checks import check_metres, check_positive
+from kornia_tidy.optics.thin_lens import PITCHES
 from kornia_tidy.sensor.sensor import SensorNoise
 
 # Electrons for each square metre of a pixel: 10,500 on 3.45 um pixels, as the EMVA 1288 data sheets of cameras with a
@@ -24,7 +25,7 @@ def full_well_of(pixel_pitch: float) -> float:
         >>> round(full_well_of(3.45e-6), -2)
         10600.0
     """
-    check_positive("pixel_pitch", pixel_pitch, "metres")
+    check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
     return FULL_WELL_DENSITY * pixel_pitch**2
 
 

@@ -107,8 +107,8 @@ class TestDepthBlur(BaseTester):
         image, depth = scene(1)
         with pytest.raises(ValueError, match=r"focus_distance must be beyond the focal length 0.05 m, got 0.04"):
             depth_blur(image, depth, 0.04, 2.0)
-        with pytest.raises(ValueError, match="f_number must be positive"):
-            depth_blur(image, depth, 1.0, 0.0)
+        with pytest.raises(ValueError, match=r"f_number must be at least 0\.5, .*, got 0\.3"):
+            depth_blur(image, depth, 1.0, 0.3)
         with pytest.raises(ValueError, match=r"pixel_pitch must be metres between 1e-07 and 0.001 .*, got 8"):
             depth_blur(image, depth, 1.0, 2.0, pixel_pitch=8)
         with pytest.raises(ValueError, match=r"focal_length must be metres between 1e-05 and 10 .*, got 50"):
@@ -181,6 +181,10 @@ class TestRandomDepthBlur(BaseTester):
         params = augmentation.forward_parameters(image.shape)
         compiled = torch.compile(augmentation, backend="eager")
         self.assert_close(compiled(image, depth, params=params), augmentation(image, depth, params=params))
+        blur, lens = DepthBlur(0.6, 2.0, **LENS), torch.tensor([0.6, 0.7])
+        whole = torch.compile(depth_blur, backend="eager", fullgraph=True)(image, depth, lens, lens + 1, **LENS)
+        self.assert_close(whole, depth_blur(image, depth, lens, lens + 1, **LENS))
+        self.assert_close(torch.export.export(blur, (image, depth)).module()(image, depth), blur(image, depth))
 
 
 class TestBehindALens(BaseTester):

@@ -133,7 +133,7 @@ class TestThinLensCamera(BaseTester):
             ({"f_number": 8, "aperture_diameter": 5e-3}, "got both: 0.005 and 8"),
             ({"f_number": 0}, "f_number must be"),
             ({"f_number": float("nan")}, "f_number must be"),
-            ({"f_number": 0.4}, "which is f/0.5"),
+            ({"f_number": 0.4}, "f_number must be at least 0.5"),
         ],
     )
     def test_exception_f_number(self, options, sentence):

@@ -17,14 +17,17 @@ from torch import nn
 
 from kornia_tidy import DefocusRange, Fidelity, PSFBank, SensorNoise, ThinLensCamera, TiDyOptics, burst, moving_capture
 from kornia_tidy.arrays import depth_tensor
+from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur
 from kornia_tidy.cli import main
 from kornia_tidy.data import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
+from kornia_tidy.lab.calibration.psf import diffraction_cutoff
 from kornia_tidy.lab.mask_export import frame_times
 from kornia_tidy.masks import PixelwiseMask, ZernikeMask, initial_heights
 from kornia_tidy.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator, Switching
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.reconstruction.trained import check_weights
+from kornia_tidy.sensor import full_well_of
 from tests.base import BaseTester, shared
 from tests.scenes import ENTRIES, load_scene
 
@@ -46,7 +49,7 @@ class TestDepth(BaseTester):
     @pytest.mark.parametrize(
         ("near", "far", "said"),
         [
-            (700, 1500, "700 m away, .* infinity: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
+            (700, 1500, "700 m away, .* beyond 23.8 m: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
             (500, 65535, "are these millimetres"),
             (70, 150, "70 m away, .*: are these centimetres.* by 0.01 .*--depth-scale 0.01"),
         ],
@@ -61,7 +64,7 @@ class TestDepth(BaseTester):
 
     def test_feature_all_beyond_a_camera_s_range_are_told_by_their_unit(self):
         optics = camera(camera=ThinLensCamera.for_scene((0.5, 4.0)))
-        with pytest.warns(UserWarning, match=r"no difference from 4 m: are these millimetres") as told:
+        with pytest.warns(UserWarning, match=r"no difference beyond 4 m: are these millimetres") as told:
             optics(*scene(900.0))
         assert len(told) == 1
 
@@ -87,9 +90,33 @@ class TestDepth(BaseTester):
         with pytest.raises(ValueError, match=r"normalised disparity in \[0, 1\], got 1.5.*: metres need a ThinLens"):
             camera(camera=DefocusRange())(*scene(1.5))
 
-    def test_exception_a_lens_for_millimetres_is_refused(self):
-        with pytest.raises(ValueError, match=r"700 to 1500 m need an aperture of 0.188 m .* millimetres, .* 0.001"):
-            ThinLensCamera.for_scene((700.0, 1500.0))
+    @pytest.mark.parametrize(
+        ("use", "said"),
+        [
+            (
+                lambda: ThinLensCamera.for_scene((700.0, 1500.0)),
+                "1500 m need .* 0.188 m .* millimetres, .* 0.001",
+            ),
+            (
+                lambda: ThinLensCamera(focus_distance=595),
+                "focus_distance is 595 m away, .*: are these mill",
+            ),
+            (lambda: ThinLensCamera(depth_range=(300, 5000)), "depth_range is 300 m away.*: are these millimetres"),
+            (lambda: RandomDepthBlur((500, 5000)), r"focus_distance is 500 m away.*millimetres\? Multiply it by 0.001"),
+            (lambda: LinearCamera(camera(), scene(700.0)[1]), "nearest pixel is 700 m away"),
+            (lambda: camera().plan(scene(700.0)[1]), "nearest pixel is 700 m away"),
+            (lambda: burst(camera(), *scene(1.0), exposure=100), "exposure is 100 s: if these are milliseconds"),
+            (lambda: ThinLensCamera().chromatic_defocus(530), "wavelength must be metres between .*530 nm is 530e-9"),
+            (lambda: PixelwiseMask(1).dispersion(0.53), "wavelength must be metres between"),
+            (lambda: diffraction_cutoff(ThinLensCamera(), 530), "wavelength must be metres between"),
+            (lambda: full_well_of(8), "pixel_pitch must be metres between"),
+        ],
+    )
+    def test_exception_other_units_of_lengths_and_times_are_told(self, use, said, monkeypatch):
+        """Warnings are errors here."""
+        monkeypatch.setattr("kornia_tidy.optics.units._TOLD", set())
+        with pytest.raises((ValueError, UserWarning), match=said):
+            use()
 
     @pytest.mark.filterwarnings("default")
     def test_smoke_command_says_it_in_a_line(self, tmp_path, capsys):

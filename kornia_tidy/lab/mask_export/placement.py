@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_positive
+from kornia_tidy.checks import check_choice, check_metres
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.masks.base import MASK_SPAN
+from kornia_tidy.optics.thin_lens import DIAMETERS, PITCHES
 
 FLIPS = ("none", "left-right", "up-down")
 ROTATIONS = (0, 90, 180, 270)
@@ -62,9 +63,9 @@ class PanelPlacement:
         if len(self.panel) != 2 or not all(isinstance(side, int) and side > 0 for side in self.panel):
             raise ValueError(f"panel must be (rows, columns), both positive whole numbers, got {self.panel}")
         check_pixels("the panel", *self.panel)
-        check_positive("panel_pitch", self.panel_pitch, "metres")
+        check_metres("panel_pitch", self.panel_pitch, *PITCHES, "8 um is 8e-6")
         if self.pupil_radius is not None:
-            check_positive("pupil_radius", self.pupil_radius, "metres")
+            check_metres("pupil_radius", self.pupil_radius, *DIAMETERS, "4 mm is 4e-3")
         if len(self.offset) != 2 or not all(isinstance(shift, int) for shift in self.offset):
             raise ValueError(f"offset must be whole panel pixels (right, down), got {self.offset}")
         check_choice("flip", self.flip, FLIPS)

@@ -17,7 +17,7 @@ from kornia_tidy.optics.lens.named_lenses import NAMED_LENSES
 from kornia_tidy.optics.lens.prescription import Prescription, half_diagonal
 from kornia_tidy.optics.lens.prescription_files import read_prescription_file
 from kornia_tidy.optics.lens.table_fit import fit_table
-from kornia_tidy.optics.spectrum import LONGEST, REFERENCE_WAVELENGTH, SHORTEST
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, check_wavelength
 from kornia_tidy.optics.thin_lens import FASTEST, ThinLensCamera
 
 RGB = (470e-9, REFERENCE_WAVELENGTH, 610e-9)
@@ -132,10 +132,7 @@ def checked_wavelengths(given: Sequence[float]) -> tuple[float, ...]:
     if isinstance(given, str) or not hasattr(given, "__len__") or not len(given):
         raise TypeError(f"wavelengths must be one or more numbers in metres such as {RGB}, got {given!r:.60}")
     for wavelength in given:
-        check_number("wavelengths", wavelength, "metres")
-        if not SHORTEST <= wavelength <= LONGEST:
-            allowed = f"metres between {SHORTEST:g} and {LONGEST:g} (530 nm is 530e-9)"
-            raise ValueError(f"wavelengths must be {allowed}, got {wavelength}")
+        check_wavelength("wavelengths", wavelength)
     return tuple(sorted({float(wavelength) for wavelength in given}))
 
 

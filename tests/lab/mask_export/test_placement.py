@@ -25,7 +25,7 @@ class TestPanelPlacement(BaseTester):
         ("options", "sentence"),
         [
             ({"panel": (0, 5)}, r"panel must be \(rows, columns\), both positive whole numbers, got \(0, 5\)"),
-            ({"panel_pitch": -1.0}, "panel_pitch must be positive and finite metres"),
+            ({"panel_pitch": 8.0}, "panel_pitch must be metres between 1e-07 and 0.001"),
             ({"pupil_radius": math.nan}, "pupil_radius must be positive and finite metres"),
             ({"offset": (0.5, 0)}, r"offset must be whole panel pixels \(right, down\), got \(0.5, 0\)"),
             ({"offset": (1, 2, 3)}, r"offset must be whole panel pixels \(right, down\), got \(1, 2, 3\)"),

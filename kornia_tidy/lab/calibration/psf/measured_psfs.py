@@ -30,7 +30,9 @@ from kornia_tidy.lab.calibration.psf.registration import Registered, register
 from kornia_tidy.lab.calibration.psf.shrinkage import shrink
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture
+from kornia_tidy.optics.spectrum import check_wavelength
 from kornia_tidy.optics.thin_lens import ThinLensCamera
+from kornia_tidy.optics.units import like_infinity, warn_of_metres
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.pupil import Pupil
@@ -240,6 +242,7 @@ def diffraction_cutoff(camera: ThinLensCamera, wavelength: float, pupil: Pupil |
         >>> round(diffraction_cutoff(ThinLensCamera(), 530e-9), 3)
         0.839
     """
+    check_wavelength("wavelength", wavelength)
     pupil = Pupil(circular_aperture(23), MASK_SPAN / 23) if pupil is None else pupil
     frequency = camera.aperture_radius * camera.pixel_pitch / (wavelength * float(camera.image_distance))
     return pupil.diameter * frequency
@@ -302,6 +305,8 @@ def measure_psfs(
         (torch.Size([1, 1, 15, 15]), 1.0)
     """
     check_depth(torch.tensor(list(images)))
+    nearest, last = min(images, default=math.inf), like_infinity(camera.aperture_radius)
+    warn_of_metres(["distance"], [nearest], camera.focal_length, last)
     limits = _limits(images, cutoff)
     check_diameter(diameter, list(images), camera)
     check_clipping(images)
