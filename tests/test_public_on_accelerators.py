@@ -47,11 +47,6 @@ def scored(loss: Callable[..., Tensor]) -> Callable[[Tensor], Tensor]:
     return lambda x: loss(x, target)
 
 
-def joint_scored() -> Callable[[Tensor], Tensor]:
-    loss, target = losses.JointLoss(), torch.rand(2, 4, 16, 16, generator=torch.Generator().manual_seed(5))
-    return lambda x: loss(x[:, :1], x, target[:, :1], target[:, 1:])
-
-
 HEADS: dict[str, Callable[[], Callable[[Tensor], Any]]] = {
     **{name: partial(test_head.trained, name) for name in test_head.HEADS},
     "closed form": lambda: test_closed_form_head.head_of(None),
@@ -63,7 +58,6 @@ HEADS: dict[str, Callable[[], Callable[[Tensor], Any]]] = {
     "residual": lambda: Residual(NAFNet(width=2)).eval(),
     "refocused": refocused,
     **{name: partial(scored, getattr(losses, name)) for name in ("mse_loss", "l1_loss", "rmse_loss", "gradient_loss")},
-    "JointLoss": joint_scored,
     "psnr": lambda: scored(metrics.psnr),
     "ssim": lambda: scored(metrics.ssim),
 }

@@ -7,7 +7,7 @@ each image. Gradients of masked pixels are exactly zero.
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from kornia_tidy.kernels.precision import safe_sqrt
 from kornia_tidy.reconstruction.validity import valid_maps
@@ -143,77 +143,6 @@ def phasecam3d_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = No
         tensor(1.0000)
     """
     return PHASECAM3D_WEIGHT * rmse_loss(prediction, target, mask) + gradient_loss(prediction, target, mask)
-
-
-def joint_loss(
-    depth: Tensor,
-    image: Tensor,
-    true_depth: Tensor,
-    true_image: Tensor,
-    mask: Tensor | None = None,
-    *,
-    depth_weight: float = 1.0,
-    image_weight: float = 1.0,
-) -> Tensor:
-    r"""Return the paper's joint loss of depth map and all-in-focus image.
-
-    .. math:: L = \lambda_{Depth} L_{Depth} + \lambda_{AiF} L_{AiF}
-
-    Args:
-        depth: predicted depth map (B, 1, H, W).
-        image: predicted all-in-focus image (B, C, H, W).
-        true_depth: (B, 1, H, W).
-        true_image: (B, C, H, W).
-        mask: bool (B, 1, H, W), True where the true depth is known. The image is known everywhere.
-        depth_weight: :math:`\lambda_{Depth}`, 1 in the paper.
-        image_weight: :math:`\lambda_{AiF}`, 1 in the paper.
-
-    Returns:
-        A scalar; it raises as :func:`mse_loss` does, which both terms are.
-
-    Source: Shah et al., TiDy-PSFs, ICCV 2023.
-
-    Example:
-        >>> maps = torch.zeros(1, 1, 2, 2), torch.zeros(1, 3, 2, 2), torch.ones(1, 1, 2, 2), torch.ones(1, 3, 2, 2)
-        >>> joint_loss(*maps, depth_weight=0.5)
-        tensor(1.5000)
-    """
-    return depth_weight * mse_loss(depth, true_depth, mask) + image_weight * mse_loss(image, true_image)
-
-
-class JointLoss(nn.Module):
-    """The paper's joint loss with its two weights; see :func:`joint_loss`.
-
-    Args:
-        depth_weight: weight of the depth term.
-        image_weight: weight of the image term.
-
-    Raises:
-        ValueError: if a weight is negative or not finite.
-
-    Example:
-        >>> criterion = JointLoss(depth_weight=10)
-        >>> criterion(*[torch.full((1, 1, 2, 2), value) for value in (0.0, 0.0, 0.5, 1.0)])
-        tensor(3.5000)
-    """
-
-    def __init__(self, depth_weight: float = 1.0, image_weight: float = 1.0) -> None:
-        super().__init__()
-        for name, weight in (("depth_weight", depth_weight), ("image_weight", image_weight)):
-            if not 0 <= weight < float("inf"):
-                raise ValueError(f"{name} must be finite and not negative, got {weight}")
-        self.depth_weight, self.image_weight = depth_weight, image_weight
-
-    def forward(
-        self, depth: Tensor, image: Tensor, true_depth: Tensor, true_image: Tensor, mask: Tensor | None = None
-    ) -> Tensor:
-        """Return the loss."""
-        weights = {"depth_weight": self.depth_weight, "image_weight": self.image_weight}
-        return joint_loss(depth, image, true_depth, true_image, mask, **weights)
-
-    def extra_repr(self) -> str:
-        """Return the weights."""
-        return f"depth_weight={self.depth_weight}, image_weight={self.image_weight}"
 
 
 def _mean(error: Tensor, mask: Tensor, sample: str = "pixel") -> Tensor:

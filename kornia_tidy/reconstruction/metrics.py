@@ -1,15 +1,12 @@
 """Metrics of depth maps and all-in-focus images: one value per image, over its valid pixels.
 
-The score of an image without a valid pixel is NaN; :class:`MeanScores` can leave such images out. A NaN at a valid
-pixel also makes the score NaN.
+The score of an image without a valid pixel is NaN, and a NaN at a valid pixel makes it NaN.
 
 PSNR and SSIM are those of ``kornia.metrics``. torchmetrics gives the same PSNR, RMSE and relative error, but its
 SSIM counts windows that reach over the border, and its metrics take no masks. It comes with the extra ``train`` only.
 """
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import kornia
 import torch
@@ -106,39 +103,6 @@ def ssim(prediction: Tensor, target: Tensor, mask: Tensor | None = None, max_val
     masked = torch.nn.functional.max_pool2d((~mask).to(similarity), SSIM_WINDOW, stride=1)  # 1: a masked pixel
     whole = masked == 0
     return _mean(torch.where(whole, similarity, 0), whole)
-
-
-def chroma_psnr(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    r"""Return the PSNR of the colour differences Cb and Cr of RGB images, pooled over both.
-
-    .. math:: C_b = 0.564 \, (B - Y), \quad C_r = 0.713 \, (R - Y), \quad Y = 0.299 R + 0.587 G + 0.114 B
-
-    It measures only the error in colour: a change of brightness that is equal in all channels does not change it.
-
-    Args:
-        prediction: (B, 3, H, W), RGB in [0, 1], encoded as sRGB.
-        target: as ``prediction``.
-        mask: as for :func:`rmse`.
-
-    Returns:
-        (B,) in decibels of the range 1, which Cb and Cr have; NaN for an image without a valid pixel.
-
-    Raises:
-        TypeError: as :func:`rmse`.
-        ValueError: as :func:`rmse`, or if the images do not have three channels.
-
-    Source: ITU-R BT.601, by :func:`kornia.color.rgb_to_ycbcr`.
-
-    Example:
-        >>> grey, blue = torch.full((1, 3, 2, 2), 0.5), torch.tensor([0.5, 0.5, 0.6]).view(1, 3, 1, 1)
-        >>> chroma_psnr(grey, blue.expand(1, 3, 2, 2)).round(decimals=2)
-        tensor([28.9200])
-    """
-    prediction, target, mask = valid_maps(prediction, target, mask)
-    if target.shape[1] != 3:
-        raise ValueError(f"chroma_psnr needs RGB images of three channels, got {target.shape[1]}")
-    ours, truth = (kornia.color.rgb_to_ycbcr(image)[:, 1:] for image in (prediction, target))
-    return psnr(ours, truth, mask[:, :2])
 
 
 def abs_rel(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -275,59 +239,6 @@ def image_scores(prediction: Tensor, target: Tensor, mask: Tensor | None = None)
     """
     maps = prediction, target, mask
     return {"rmse": rmse(*maps), "psnr": psnr(*maps), "ssim": ssim(*maps)}
-
-
-class MeanScores:
-    """Mean of scores over the images of a data set, batch by batch, each image with the same weight.
-
-    Example:
-        >>> mean = MeanScores()
-        >>> mean.add({"rmse": torch.tensor([0.1, 0.3])})
-        >>> mean.add({"rmse": torch.tensor([float("nan"), 0.5])}, counted=torch.tensor([False, True]))
-        >>> mean.images, mean.left_out, round(mean.compute()["rmse"], 6)
-        (3, 1, 0.3)
-    """
-
-    def __init__(self) -> None:
-        self.images = 0  # counted so far
-        self.left_out = 0
-        self._totals: dict[str, float] = {}
-
-    def add(self, scores: Mapping[str, Tensor], counted: Tensor | None = None) -> None:
-        """Add the scores of a batch.
-
-        Args:
-            scores: (B,) values by name, such as :func:`depth_scores` returns; the same names in every batch.
-            counted: bool (B,), False for images to leave out: ``mask.flatten(1).any(1)`` leaves out those without a
-                valid pixel. None: all images count, and one NaN makes the mean NaN.
-
-        Raises:
-            ValueError: if names or shapes do not fit.
-        """
-        if not scores:
-            raise ValueError("scores must hold at least one metric, got none")
-        if self._totals and self._totals.keys() != scores.keys():
-            raise ValueError(f"scores must be {sorted(self._totals)} as in the first batch, got {sorted(scores)}")
-        sizes = {tuple(value.shape) for value in [*scores.values(), *([] if counted is None else [counted])]}
-        if len(sizes) > 1 or len(next(iter(sizes))) != 1:
-            raise ValueError(f"scores and counted must all have one shape (B,), got {sorted(sizes)}")
-        size = next(iter(sizes))[0]
-        taken = size if counted is None else int(counted.sum())
-        for name, value in scores.items():
-            kept = value if counted is None else value[counted]
-            self._totals[name] = self._totals.get(name, 0.0) + float(kept.detach().double().sum())
-        self.images += taken
-        self.left_out += size - taken
-
-    def compute(self) -> dict[str, float]:
-        """Return the means.
-
-        Raises:
-            ValueError: if no image was counted.
-        """
-        if not self.images:
-            raise ValueError(f"a mean needs at least one image, got 0 counted and {self.left_out} left out")
-        return {name: total / self.images for name, total in self._totals.items()}
 
 
 def _valid_depths(prediction: Tensor, target: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:

@@ -5,9 +5,7 @@ import pytest
 import torch
 
 from kornia_tidy.reconstruction.losses import (
-    JointLoss,
     gradient_loss,
-    joint_loss,
     l1_loss,
     mse_loss,
     phasecam3d_loss,
@@ -97,31 +95,3 @@ class TestGradientLoss(BaseTester):
         maps = torch.zeros(shape, device=device)
         with pytest.raises(ValueError, match=f"at least one valid pair of pixels {name} each other"):
             gradient_loss(maps, maps)
-
-
-class TestJointLoss(BaseTester):
-    def make(self, device, dtype=torch.float64):
-        depth, true_depth, mask = make_maps((2, 1, 4, 5), device, dtype)
-        return depth, torch.rand(2, 3, 4, 5, device=device, dtype=dtype), true_depth, mask
-
-    def test_feature_weighs_depth_where_known_and_the_image_everywhere(self, device, dtype):
-        depth, image, true_depth, mask = self.make(device, dtype)
-        true_image = torch.zeros_like(image)
-        value = joint_loss(depth, image, true_depth, true_image, mask, depth_weight=3, image_weight=0.5)
-        expected = 3 * by_hand(mse_loss, depth, true_depth, mask) + 0.5 * image.double().square().mean().item()
-        self.assert_close(value.double().cpu(), torch.tensor(expected, dtype=torch.float64))
-        assert JointLoss(3, 0.5)(depth, image, true_depth, true_image, mask) == value
-
-    def test_feature_the_papers_weights_are_one(self, device):
-        zeros, ones = torch.zeros(1, 1, 2, 2, device=device), torch.ones(1, 1, 2, 2, device=device)
-        assert joint_loss(zeros, 2 * ones, ones, zeros) == 1 + 4
-        assert JointLoss()(zeros, 2 * ones, ones, zeros) == 1 + 4
-
-    def test_gradcheck(self, device):
-        depth, image, true_depth, mask = self.make(device)
-        self.gradcheck(lambda d, i: joint_loss(d, i, true_depth, torch.zeros_like(i), mask), (depth, image))
-
-    @pytest.mark.parametrize("weight", [-1.0, float("inf"), float("nan")])
-    def test_exception_names_the_weight(self, weight):
-        with pytest.raises(ValueError, match=f"depth_weight must be finite and not negative, got {weight}"):
-            JointLoss(depth_weight=weight)

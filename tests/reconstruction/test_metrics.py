@@ -9,9 +9,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from kornia_tidy.reconstruction.metrics import (
-    MeanScores,
     abs_rel,
-    chroma_psnr,
     defocus_scores,
     delta_accuracy,
     depth_scores,
@@ -143,25 +141,6 @@ class TestKornia(BaseTester):
             ssim(small, small)
 
 
-class TestChroma(BaseTester):
-    def test_feature_equals_numpy_image_by_image(self, device, dtype):
-        prediction, target, mask = make_depths((3, 3, 24, 27), device, dtype)
-        expected = []
-        for x, z, seen in zip(prediction.double().cpu(), target.double().cpu(), mask.cpu(), strict=True):
-            red, green, blue = (x - z)[:, seen[0]].numpy()
-            luma = 0.299 * red + 0.587 * green + 0.114 * blue
-            errors = np.concatenate([0.564 * (blue - luma), 0.713 * (red - luma)])
-            expected.append(-10 * math.log10(np.mean(errors**2)))
-        self.assert_close(chroma_psnr(prediction, target, mask).double().cpu(), torch.tensor(expected).double())
-
-    def test_exception_grey_images(self, device):
-        with pytest.raises(ValueError, match="needs RGB images of three channels, got 1"):
-            chroma_psnr(torch.rand(1, 1, 4, 4, device=device), torch.rand(1, 1, 4, 4, device=device))
-
-    def test_gradcheck(self, device):
-        self.gradcheck(chroma_psnr, tuple(torch.rand(2, 1, 3, 4, 4, device=device)))
-
-
 class TestDepth(BaseTester):
     @pytest.mark.parametrize("metric", [abs_rel, log10_error, delta_accuracy, depth_scores])
     @pytest.mark.parametrize("bad", [0.0, -1.0, float("inf"), float("nan")])
@@ -199,45 +178,3 @@ class TestDepth(BaseTester):
         assert round(scores["rmse_unit"].item(), 5) == 0.02605
         assert round(scores["rmse_radians"].item(), 3) == 0.521
         assert round(defocus_scores(target + 0.02605, target, span=40)["rmse_radians"].item(), 3) == 1.042
-
-
-class TestMeanScores(BaseTester):
-    def test_feature_equals_the_mean_over_all_images_however_batched(self):
-        values = torch.rand(7, dtype=torch.float64)
-        whole, parts = MeanScores(), MeanScores()
-        whole.add({"a": values, "b": 2 * values})
-        for batch in values.split(3):
-            parts.add({"b": 2 * batch, "a": batch})
-        assert parts.images == 7
-        assert parts.compute() == pytest.approx({"a": values.mean().item(), "b": 2 * values.mean().item()}, rel=1e-12)
-        assert parts.compute() == pytest.approx(whole.compute(), rel=1e-12)
-
-    def test_feature_images_are_left_out_only_when_told(self):
-        prediction, target, mask = make_depths()
-        mask[2] = False
-        scores, told, untold = depth_scores(prediction, target, mask), MeanScores(), MeanScores()
-        told.add(scores, counted=mask.flatten(1).any(1))
-        untold.add(scores)
-        assert (told.images, told.left_out) == (2, 1)
-        assert told.compute()["rmse"] == pytest.approx(scores["rmse"][:2].mean().item(), rel=1e-12)
-        assert math.isnan(untold.compute()["rmse"])
-
-    def test_feature_keeps_no_graph(self):
-        mean, value = MeanScores(), torch.rand(2, requires_grad=True)
-        mean.add({"a": 2 * value})
-        assert isinstance(mean.compute()["a"], float)
-
-    def test_exception_names_and_shapes(self):
-        mean = MeanScores()
-        with pytest.raises(ValueError, match="at least one image, got 0 counted and 0 left out"):
-            mean.compute()
-        with pytest.raises(ValueError, match="at least one metric, got none"):
-            mean.add({})
-        mean.add({"a": torch.zeros(2)})
-        with pytest.raises(ValueError, match=r"must be \['a'\] as in the first batch, got \['b'\]"):
-            mean.add({"b": torch.zeros(2)})
-        with pytest.raises(ValueError, match=r"one shape \(B,\), got \[\(2,\), \(3,\)\]"):
-            mean.add({"a": torch.zeros(2)}, counted=torch.ones(3, dtype=torch.bool))
-        with pytest.raises(ValueError, match=r"one shape \(B,\), got \[\(\)\]"):
-            mean.add({"a": torch.zeros(())})
-        assert mean.images == 2

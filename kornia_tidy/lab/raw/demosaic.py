@@ -53,11 +53,13 @@ def demosaic(
             * ``"half"``: no interpolation. Each 2x2 tile (3x3 for X-Trans) becomes one pixel, the mean of each colour.
             * ``"libraw_linear"``, ``"libraw_vng"``: Bayer and four-colour; ``"libraw_ppg"``, ``"libraw_ahd"``,
               ``"libraw_dcb"``, ``"libraw_dht"``: Bayer; ``"libraw_markesteijn"``: X-Trans.
-        to_srgb: matrix from the balanced colours to linear sRGB, (3, 3). ``"libraw_ahd"`` and
-            ``"libraw_markesteijn"`` need it to compare colours in CIELAB. Default: the identity.
+        to_srgb: matrix from the balanced colours to linear sRGB, (3, C), by which the result is multiplied; quantised
+            methods do it in the pass that restores real values. ``"libraw_ahd"`` and ``"libraw_markesteijn"`` compare
+            colours in CIELAB by it. None: the colours of the array are returned, and count as those of sRGB.
 
     Returns:
-        (..., C, H, W) with C different colours, in the order of ``colors``; ``"half"``: (..., C, H // 2, W // 2).
+        (..., C, H, W) with C different colours, in the order of ``colors``, or (..., 3, H, W) in linear sRGB;
+        ``"half"``: (..., H // 2, W // 2).
 
     Raises:
         ValueError: if the method is unknown or does not support this tile or size, if the mosaic has another shape, or
@@ -76,37 +78,10 @@ def demosaic(
         >>> rgb = demosaic(mosaic, ((0, 1), (3, 2)), "RGBG")
         >>> rgb[:, 1, 2]
         tensor([0.9000, 0.5000, 0.1000])
-    """
-    return _demosaic(mosaic, pattern, colors, method, to_srgb, None)
-
-
-def demosaic_to_srgb(mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor) -> Tensor:
-    """Demosaic and convert to linear sRGB, (..., 3, H, W): the result of :func:`demosaic` times ``to_srgb``.
-
-    Quantised methods multiply by the matrix in the pass that restores real values. The arguments are those of
-    :func:`demosaic`, with ``to_srgb`` of shape (3, colours).
-
-    Example:
         >>> matrix = torch.tensor([[1.0, 0, 0], [0, 0.5, 0], [0, 0.5, 0.5]])
-        >>> mosaic = torch.tensor([[[0.9, 0.5, 0.9, 0.5], [0.5, 0.1, 0.5, 0.1]]])
-        >>> demosaic_to_srgb(mosaic, ((0, 1), (3, 2)), "RGBG", "bilinear", matrix)[:, 1, 2]
+        >>> demosaic(mosaic, ((0, 1), (3, 2)), "RGBG", to_srgb=matrix)[:, 1, 2]
         tensor([0.9000, 0.2500, 0.3000])
     """
-    return _demosaic(mosaic, pattern, colors, method, to_srgb, to_srgb)
-
-
-def mixed(image: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply the colours of an image (..., colours, H, W) by a matrix (3, colours), in place for three colours."""
-    result = image if image.shape[-3] == 3 else image.new_empty(*image.shape[:-3], 3, *image.shape[-2:])
-    for top in range(0, image.shape[-2], ROWS_AT_ONCE):
-        rows = slice(top, top + ROWS_AT_ONCE)
-        result[..., rows, :] = torch.einsum("ij,...jhw->...ihw", matrix.to(image), image[..., rows, :])
-    return result
-
-
-def _demosaic(
-    mosaic: Tensor, pattern: Tile, colors: str, method: str, to_srgb: Tensor | None, mixture: Tensor | None
-) -> Tensor:
     check_choice("method of demosaicing", method, METHODS)
     check_float_tensor("mosaic", mosaic.reshape(-1, *mosaic.shape[-2:]), 3, "(..., 1, H, W)")
     if mosaic.ndim < 3 or mosaic.shape[-3] != 1:
@@ -120,12 +95,19 @@ def _demosaic(
     letters = "".join(names[index] for row in tile for index in row)
     if method in {"bilinear", "half"}:
         image = (bilinear if method == "bilinear" else binned)(flat, tile)
+        image = image if to_srgb is None else mixed(image, to_srgb)
     else:
-        matrix = torch.eye(len(names)) if mixture is None else mixture
-        image, mixture = _libraw(flat, letters, names, method.removeprefix("libraw_"), to_srgb, matrix), None
-    if mixture is not None:
-        image = mixed(image, mixture)
+        image = _libraw(flat, letters, names, method.removeprefix("libraw_"), to_srgb)
     return image.reshape(*mosaic.shape[:-3], *image.shape[-3:])
+
+
+def mixed(image: Tensor, matrix: Tensor) -> Tensor:
+    """Multiply the colours of an image (..., colours, H, W) by a matrix (3, colours), in place for three colours."""
+    result = image if image.shape[-3] == 3 else image.new_empty(*image.shape[:-3], 3, *image.shape[-2:])
+    for top in range(0, image.shape[-2], ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
+        result[..., rows, :] = torch.einsum("ij,...jhw->...ihw", matrix.to(image), image[..., rows, :])
+    return result
 
 
 def bilinear(mosaic: Tensor, tile: Tile) -> Tensor:
@@ -202,7 +184,7 @@ def _holds_all(tile: Tile, side: int, step: int) -> bool:
     )
 
 
-def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None, matrix: Tensor) -> Tensor:
+def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tensor | None) -> Tensor:
     rawpy = import_installed("rawpy")  # a C++ library, loaded only when needed
 
     four = len(colors) == len(letters) == 4
@@ -232,6 +214,7 @@ def _libraw(mosaic: Tensor, letters: str, colors: str, name: str, to_srgb: Tenso
             )
 
     wide = mosaic[:, _beyond(height, side, margin)][:, :, _beyond(width, side, margin)] if margin > 0 else mosaic
+    matrix = torch.eye(len(colors)) if to_srgb is None else to_srgb
     image = demosaic_quantised(wide, postprocess, matrix, LIBRAW_REACH if name in LIBRAW_LOCAL else None)
     return image[..., margin : margin + height, margin : margin + width] if margin > 0 else image
 

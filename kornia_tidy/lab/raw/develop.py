@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 from kornia_tidy.checks import check_choice, check_finite
 from kornia_tidy.lab.raw.auto_balance import auto_balance
 from kornia_tidy.lab.raw.color import assumed_camera_to_srgb, camera_to_srgb
-from kornia_tidy.lab.raw.demosaic import BAYER, demosaic_to_srgb, mixed
+from kornia_tidy.lab.raw.demosaic import BAYER, demosaic, mixed
 from kornia_tidy.lab.raw.filter_array import is_xtrans, tiled
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def develop(
     elif raw.pattern is None:
         image = mixed(mosaic, to_srgb)
     else:
-        image = demosaic_to_srgb(mosaic, raw.pattern, raw.colors, method or default_method(raw), to_srgb)
+        image = demosaic(mosaic, raw.pattern, raw.colors, method or default_method(raw), to_srgb)
     if square_pixels and raw.pixel_aspect != 1:
         image = squared(image, raw.pixel_aspect)
     if encoded:

@@ -8,11 +8,11 @@ from functools import cache
 from pathlib import Path
 
 import torch
-from kornia.color import rgb_to_y
+from kornia.color import rgb_to_y, rgb_to_ycbcr
 from kornia.filters import box_blur
 from torch import Tensor
 
-from kornia_tidy.reconstruction.metrics import chroma_psnr, psnr, rmse, ssim
+from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 from kornia_tidy.reconstruction.reliability import sparsification_curve
 from tests.benchmarks.results.scenes import BenchScene
 
@@ -41,6 +41,12 @@ def image_scores(scene: BenchScene, image: Tensor) -> Scores:
     if (distance := perceptual_distance()) is not None:
         scores["lpips"] = distance(*pair)
     return {name: float(value) for name, value in scores.items()}
+
+
+def chroma_psnr(prediction: Tensor, target: Tensor) -> Tensor:
+    """Return the PSNR of the colour differences Cb and Cr of ITU-R BT.601, pooled over both, of RGB images."""
+    ours, truth = (rgb_to_ycbcr(image)[:, 1:] for image in (prediction, target))
+    return psnr(ours, truth)
 
 
 def depth_scores(scene: BenchScene, inverse_depth: Tensor) -> Scores:
