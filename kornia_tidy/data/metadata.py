@@ -14,6 +14,7 @@ from fractions import Fraction
 from typing import Any
 
 from kornia_tidy.data.picture_header import JPEG, PNG
+from kornia_tidy.data.tiff_directories import Directory
 
 ASCII, SHORT, LONG, RATIONAL, UNDEFINED = 2, 3, 4, 5, 7  # types of TIFF fields
 SIZES = {1: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, 6: 1, UNDEFINED: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes
@@ -111,12 +112,10 @@ def _exif_block(picture: list[Field], photo: list[Field]) -> bytes:
 def _with_directories(file: bytes, picture: list[Field], photo: list[Field]) -> bytes:
     """Return a TIFF file with a second, extended directory appended; the data it refers to stay in place."""
     (place,) = struct.unpack_from("<I", file, 4)
-    (count,) = struct.unpack_from("<H", file, place)
     fields: list[Field] = []
-    for entry in range(place + 2, place + 2 + 12 * count, 12):
-        tag, kind, number = struct.unpack_from("<HHI", file, entry)
+    for tag, (kind, number, begins) in Directory(file, place).fields.items():
         size = SIZES[kind] * number
-        begin = entry + 8 if size <= 4 else struct.unpack_from("<I", file, entry + 8)[0]
+        begin = begins if size <= 4 else struct.unpack_from("<I", file, begins)[0]
         fields.append((tag, kind, number, file[begin : begin + size]))
     file += b"\0" * (len(file) % 2)
     exif = directory(photo, len(file))

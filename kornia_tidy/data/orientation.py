@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from kornia_tidy.data.picture_header import JPEG, PNG, jpeg_segments, png_chunks
+from kornia_tidy.data.tiff_directories import Directory
 from kornia_tidy.optics.units import warn_once
 
 STORED = {
@@ -100,15 +101,9 @@ def _turn(block: bytes) -> tuple[int, int] | None:
     if block[:4] not in {b"II*\0", b"MM\0*"}:
         match = _XMP_TURN.search(block)
         return (1, int(match[1])) if match else None
-    order = "<" if block.startswith(b"II") else ">"
-    with suppress(struct.error):
-        (place,) = struct.unpack_from(f"{order}I", block, 4)
-        (count,) = struct.unpack_from(f"{order}H", block, place)
-        for entry in range(place + 2, place + 2 + 12 * count, 12):
-            tag, kind = struct.unpack_from(f"{order}HH", block, entry)
-            if tag == _TAG and kind in {1, 3, 4}:
-                (value,) = struct.unpack_from(order + {1: "B", 3: "H", 4: "I"}[kind], block, entry + 8)
-                return (0, value) if 1 <= value <= 8 else None
+    with suppress(ValueError):
+        turn = Directory(block, int.from_bytes(block[4:8], "little" if block[:2] == b"II" else "big")).number(_TAG, 0)
+        return (0, turn) if 1 <= turn <= 8 else None
     return None
 
 
