@@ -18,10 +18,11 @@ from kornia_tidy.data import DeadLeaves, dead_leaves, photographic_leaves, rando
 from kornia_tidy.design import DesignTask
 from kornia_tidy.design.candidates import initial_phase
 from kornia_tidy.masks import initial_heights
-from kornia_tidy.optics import SYSTEMS
+from kornia_tidy.optics import SYSTEMS, ThinLensCamera
 from kornia_tidy.seeds import item_generator
 from kornia_tidy.training.noisy_crops import random_error, random_gain, random_sensor
 from kornia_tidy.training.scenes import augmented
+from kornia_tidy.training.settings import LightSettings
 from tests.base import BaseTester
 from tests.masks.registry import ONE_MASK, TWO_MASKS
 
@@ -79,7 +80,7 @@ DRAWS: dict[str, Callable[[], Any]] = {
     "training gain": lambda: by_global_generator(lambda: random_gain(torch.tensor([1.0, 0.8, 0.5], dtype=SINGLE))),
     "training error": lambda: by_global_generator(lambda: torch.tensor(random_error(), dtype=SINGLE)),
     "training sensor": lambda: by_global_generator(
-        lambda: torch.tensor(random_sensor((0.001, 0.03)).sigma, dtype=SINGLE)
+        lambda: torch.tensor(random_sensor(LightSettings(), ThinLensCamera()).sigma, dtype=SINGLE)
     ),
     "RandomDepthBlur": lambda: of_augmentation(lambda: ours.RandomDepthBlur(p=1.0, **LENS)),
     "RandomSensorNoise": lambda: of_augmentation(lambda: ours.RandomSensorNoise(p=1.0)),

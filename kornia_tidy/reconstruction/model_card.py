@@ -78,9 +78,7 @@ def model_card(system: TrainedSystem, title: str, license: str | None = None) ->
     check_license(license)
     settings = system.settings
     title = " ".join(title.split())
-    estimates = " and ".join(
-        {"image": "the image in focus everywhere", "depth": "depth"}[m] for m in MAPS[settings.task]
-    )
+    estimates = " and ".join(_ESTIMATES[name] for name in MAPS[settings.task])
     sections = [
         _metadata(settings, license),
         f"# {title}\n\nA simulated camera with {_masks(system)} and a network that reconstructs {estimates} from one "

@@ -36,7 +36,7 @@ from kornia_tidy.sensor.sensor import SensorNoise
 from kornia_tidy.training.average import MovingAverage
 from kornia_tidy.training.designed import design_masks
 from kornia_tidy.training.drawn_sensors import SensorEach, with_sensor
-from kornia_tidy.training.noisy_crops import electrons_of, random_sensor
+from kornia_tidy.training.noisy_crops import random_sensor
 from kornia_tidy.training.random_state import seeded
 from kornia_tidy.training.scenes import Broken
 from kornia_tidy.training.settings import TrainingSettings, differences
@@ -162,8 +162,7 @@ class TidyTraining(pl.LightningModule):
             design_masks(optics, settings.design, progress=progress)
             optics.fidelity = optics.fidelity.replace(window=settings.window)
             fix_window(optics)  # for the designed masks
-        electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
-        sensors = partial(random_sensor, settings.noise_range, electrons) if settings.learn == "masks" else None
+        sensors = partial(random_sensor, settings, optics.camera) if settings.learn == "masks" else None
         return cls(optics, build_head(settings), settings, sensors=sensors, window=optics.window)
 
     def train(self, mode: bool = True) -> Self:

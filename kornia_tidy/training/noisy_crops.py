@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -11,16 +11,18 @@ from torch.utils.data import Dataset
 
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_part
+from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
 from kornia_tidy.sensor.exposure import electrons_at
 from kornia_tidy.sensor.sensor import SensorNoise
+from kornia_tidy.settings import check_settings
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
+from kornia_tidy.training.settings import LightSettings
 
 GAIN = (0.5, 2.0)  # range of the exposure factor, uniform in its logarithm
 TINT = 0.1  # standard deviation of the logarithm of each channel's factor, as of another illuminant
 SHOT_SHARE = 0.5  # share of captures with shot noise; the others have read noise alone
 FULL_WELL = (500.0, 60e3)  # electrons, uniform in its logarithm: at a level of 0.3, a noise of 0.024 to 0.0022
 READ_ELECTRONS = 2.4  # read noise of captures with shot noise, as of an industrial sensor
-TOLD_ERROR = 2.5  # largest factor between the stated and the true noise in training
 
 
 class NoisyCrops(Dataset):
@@ -43,15 +45,12 @@ class NoisyCrops(Dataset):
         captures: of fixed optics.
         optics: their camera, for the encoding of the sensor's values.
         crop: side of the crop in pixels. None: the whole capture.
-        noise_range: least and largest standard deviation of the read noise, in linear light, full scale 1.
-        electrons: least and largest full well of the captures with shot noise, see :func:`electrons_of`.
+        light: ranges of the noise. None: the defaults.
         gain: draw gains, and errors of the stated noise. False: the gain is one and the noise the true one, as
             for validation.
-        noise_error: largest factor between the stated and the true noise, at least 1.
 
     Raises:
-        ValueError: if a range is not 0 < least <= largest, the factor is below 1, or a capture is smaller than the
-            crop.
+        ValueError: if a range of ``light`` is out of order, or a capture is smaller than the crop.
 
     Convention:
         Items are mappings of
@@ -71,18 +70,15 @@ class NoisyCrops(Dataset):
         captures: NoiseFreeCaptures,
         optics: TiDyOptics,
         crop: int | None = None,
-        noise_range: tuple[float, float] = (1e-3, 0.03),
-        electrons: tuple[float, float] = FULL_WELL,
+        light: LightSettings | None = None,
         *,
         gain: bool = True,
-        noise_error: float = TOLD_ERROR,
     ) -> None:
-        check_noise_range(noise_range)
-        check_electrons(electrons)
-        check_noise_error(noise_error)
         check_part("captures", captures, NoiseFreeCaptures, "NoiseFreeCaptures")
-        self.captures, self.encode, self.crop, self.gain = captures, optics.encode, crop, gain
-        self.noise_range, self.electrons, self.noise_error = noise_range, electrons, noise_error
+        self.captures, self.optics, self.crop, self.gain = captures, optics, crop, gain
+        self.light = light or LightSettings()
+        check_settings(self.light)
+        self.light.check_light()
 
     def __len__(self) -> int:
         """Return the number of captures."""
@@ -97,56 +93,29 @@ class NoisyCrops(Dataset):
         if self.gain:
             gain = random_gain(torch.maximum(light.amax((1, 2)), image.amax((1, 2))))
             light, image = light * gain, image * gain
-        sensor = random_sensor(self.noise_range, self.electrons)
+        sensor = random_sensor(self.light, self.optics.camera)
         coded = sensor(light[None])[0]
         told = sensor.std(coded)
         return {
-            "coded": self.encode(coded[None])[0],
-            "image": self.encode(image[None])[0],
+            "coded": self.optics.encode(coded[None])[0],
+            "image": self.optics.encode(image[None])[0],
             "inverse_depth": inverse_depth,
             "mask": mask,
-            "noise": told * random_error(self.noise_error) if self.gain else told,
+            "noise": told * random_error(self.light.noise_error) if self.gain else told,
         }
 
 
-def check_noise_range(noise_range: tuple[float, float]) -> None:
-    """Raise ``ValueError`` unless a range of standard deviations is positive and ordered."""
-    least, largest = noise_range
-    if not 0 < least <= largest < 1:
-        raise ValueError(f"noise_range must be 0 < least <= largest < 1 of full scale, got {least} and {largest}")
-
-
-def check_electrons(electrons: tuple[float, float]) -> None:
-    """Raise ``ValueError`` unless a range of electrons is finite, positive and ordered."""
-    least, largest = electrons
-    if not 0 < least <= largest < math.inf:
-        raise ValueError(f"electrons must be 0 < least <= largest, got {least} and {largest}")
-
-
-def check_noise_error(factor: float) -> None:
-    """Raise ``ValueError`` unless a factor of the noise is finite and at least 1."""
-    if not 1 <= factor < math.inf:
-        raise ValueError(f"noise_error must be a factor of at least 1, got {factor}")
-
-
-def electrons_of(
-    f_number: float, electrons: tuple[float, float] | None, reference_f_number: float
-) -> tuple[float, float]:
+def full_wells(light: LightSettings, lens: ThinLensCamera | DefocusRange) -> tuple[float, float]:
     """Return the range of the full well in training, the same exposure time and light for every aperture.
 
-    Args:
-        f_number: of the camera.
-        electrons: least and largest number of electrons of a white pixel at the reference f-number. None: ``FULL_WELL``
-            for every aperture.
-        reference_f_number: f-number at which they are counted.
-
     Example:
-        >>> electrons_of(35.2, (500, 57000), 17.6)
+        >>> full_wells(LightSettings(electrons=(500, 57000), reference_f_number=17.6), ThinLensCamera(f_number=35.2))
         (125.0, 14250.0)
     """
-    if electrons is None:
+    if light.electrons is None:
         return FULL_WELL
-    least, largest = (electrons_at(f_number, count, reference_f_number) for count in electrons)
+    f_number = cast("ThinLensCamera", lens).f_number
+    least, largest = (electrons_at(f_number, count, light.reference_f_number) for count in light.electrons)
     return least, largest
 
 
@@ -180,7 +149,7 @@ def random_gain(peak: Tensor) -> Tensor:
     return torch.minimum(gain, 1 / peak.clamp(min=1e-6))[:, None, None]
 
 
-def random_error(largest: float = TOLD_ERROR) -> float:
+def random_error(largest: float = LightSettings.noise_error) -> float:
     """Return a factor between one over the largest and the largest, uniform in its logarithm, by the global generator.
 
     From wrong noise levels a network learns to check the capture: a user seldom knows the noise of a
@@ -194,22 +163,18 @@ def random_error(largest: float = TOLD_ERROR) -> float:
     return largest ** (2 * float(torch.rand((), dtype=torch.float32)) - 1)
 
 
-def random_sensor(noise_range: tuple[float, float], electrons: tuple[float, float] = FULL_WELL) -> SensorNoise:
+def random_sensor(light: LightSettings, lens: ThinLensCamera | DefocusRange) -> SensorNoise:
     """Return a sensor with a noise drawn by torch's global generator; see :class:`NoisyCrops`.
 
-    Args:
-        noise_range: least and largest standard deviation of read noise without shot noise.
-        electrons: least and largest full well of sensors with shot noise.
-
     Example:
-        >>> sensors = [random_sensor((0.001, 0.03), electrons=(1e3, 1e4)) for _ in range(100)]
+        >>> sensors = [random_sensor(LightSettings(), ThinLensCamera()) for _ in range(100)]
         >>> {sensor.full_well is None for sensor in sensors} == {True, False}
         True
         >>> all(0.001 <= sensor.sigma <= 0.03 for sensor in sensors if sensor.full_well is None)
         True
     """
     with_shot, place = torch.rand(2, dtype=torch.float32).tolist()
-    least, largest = electrons if with_shot < SHOT_SHARE else noise_range
+    least, largest = full_wells(light, lens) if with_shot < SHOT_SHARE else light.noise_range
     level = least * (largest / least) ** place
     if with_shot < SHOT_SHARE:
         return SensorNoise(READ_ELECTRONS / level, full_well=level)

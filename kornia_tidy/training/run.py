@@ -43,7 +43,7 @@ from kornia_tidy.training.data_module import SceneData
 from kornia_tidy.training.data_sets import PAINTED, make_scenes
 from kornia_tidy.training.module import TidyTraining
 from kornia_tidy.training.noise_free import NoiseFreeCaptures
-from kornia_tidy.training.noisy_crops import NoisyCrops, electrons_of
+from kornia_tidy.training.noisy_crops import NoisyCrops
 from kornia_tidy.training.settings import TrainingSettings, differences
 from kornia_tidy.training.stored_run import check_stored_run
 
@@ -265,9 +265,7 @@ def _crops(split: str, scenes: Dataset[Any], module: TidyTraining, folder: Path)
     if settings.data not in PAINTED:  # of files, the number decides which are drawn
         about["scenes"] = len(cast("Any", scenes))
     captures = NoiseFreeCaptures(scenes, module.optics, folder / split, about)
-    electrons = electrons_of(settings.camera().f_number, settings.electrons, settings.reference_f_number)
-    light, crop = (settings.noise_range, electrons), settings.crop if training else None
-    return NoisyCrops(captures, module.optics, crop, *light, gain=training, noise_error=settings.noise_error)
+    return NoisyCrops(captures, module.optics, settings.crop if training else None, settings, gain=training)
 
 
 def _is_first_process() -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,18 +14,20 @@ from torch.utils.data import Dataset
 
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import DeadLeaves
+from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.reconstruction.tasks import normalised_inverse_depth
 from kornia_tidy.training.noise_free import LEVELS, NoiseFreeCaptures
 from kornia_tidy.training.noisy_crops import (
     FULL_WELL,
     GAIN,
     NoisyCrops,
-    electrons_of,
+    full_wells,
     random_gain,
     random_sensor,
     random_window,
 )
 from kornia_tidy.training.scenes import SceneLoader
+from kornia_tidy.training.settings import LightSettings
 from tests.base import BaseTester
 
 SIDE = 32
@@ -116,7 +119,9 @@ class TestNoisyCrops(BaseTester):
         """The light of a point lies to its right in every sample, as in a capture by a camera that is tilted so."""
         optics = camera(tilt=1.5e-7, color_space="linear")
         captures = NoiseFreeCaptures(Points(), optics, tmp_path)
-        crops = NoisyCrops(captures, optics, SIDE - 4, (1e-5, 1e-5), (60e3, 60e3))
+        lens = optics.camera
+        light = LightSettings(noise_range=(1e-5, 1e-5), electrons=(60e3, 60e3), reference_f_number=lens.f_number)
+        crops = NoisyCrops(captures, optics, SIDE - 4, light)
         torch.manual_seed(0)
         columns = torch.arange(SIDE - 4.0)
         for draw in range(24):
@@ -130,7 +135,7 @@ class TestNoisyCrops(BaseTester):
         """Divided by the noise-free crop, both are one number for each channel."""
         captures, optics = leaves
         linear = TiDyOptics(optics.masks, sensor=None, fidelity="draft", color_space="linear")
-        crops = NoisyCrops(captures, linear, SIDE, (1e-6, 1e-6))
+        crops = NoisyCrops(captures, linear, SIDE, LightSettings(noise_range=(1e-6, 1e-6)))
         gains = []
         for seed in range(12):
             torch.manual_seed(seed)
@@ -165,14 +170,15 @@ class TestNoisyCrops(BaseTester):
         """By a factor of 2.5 at most, in both directions; 40 samples of read noise alone, so that it is one number."""
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0)
         captures, optics = grey
-        crops, factors = NoisyCrops(captures, optics, noise_range=(0.01, 0.01)), []
+        light, factors = LightSettings(noise_range=(0.01, 0.01)), []
+        crops = NoisyCrops(captures, optics, light=light)
         for seed in range(40):
             torch.manual_seed(seed)
             factors.append(float(crops[seed]["noise"].mean()) / 0.01)
         assert 0.4 - 1e-6 <= min(factors) < 0.8  # less likely than 1e-8 otherwise
         assert 1.25 < max(factors) <= 2.5 + 1e-6
         assert min(abs(factor - 1) for factor in factors) < 0.25
-        exact = NoisyCrops(captures, optics, noise_range=(0.01, 0.01), noise_error=1.0)
+        exact = NoisyCrops(captures, optics, light=replace(light, noise_error=1.0))
         for seed in range(5):
             torch.manual_seed(seed)
             assert float(exact[seed]["noise"].mean()) == pytest.approx(0.01, rel=1e-5)
@@ -182,22 +188,27 @@ class TestNoisyCrops(BaseTester):
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 1.0)
         captures, _ = leaves
         linear = TiDyOptics(sensor=None, fidelity="draft", color_space="linear")
-        sample = NoisyCrops(captures, linear, electrons=(200.0, 200.0), gain=False)[0]
+        light = LightSettings(electrons=(200.0, 200.0), reference_f_number=linear.camera.f_number)
+        sample = NoisyCrops(captures, linear, light=light, gain=False)[0]
         expected = ((2.4 / 200) ** 2 + sample["coded"] / 200).sqrt()
         self.assert_close(sample["noise"], expected, rtol=1e-5, atol=1e-7)
         assert sample["noise"].std() > 1e-3
 
     def test_feature_electrons_fall_with_the_square_of_the_f_number(self):
-        assert electrons_of(35.2, (500.0, 57e3), 17.6) == (125.0, 14250.0)
-        assert electrons_of(50.0, None, 17.6) == FULL_WELL
+        light, stopped_down = (
+            LightSettings(electrons=(500.0, 1e3), reference_f_number=17.6),
+            ThinLensCamera(f_number=35.2),
+        )
+        assert full_wells(light, stopped_down) == (125.0, 250.0)
+        assert full_wells(LightSettings(), stopped_down) == FULL_WELL
         torch.manual_seed(0)
-        wells = [random_sensor((1e-3, 0.03), (125.0, 250.0)).full_well for _ in range(50)]
+        wells = [random_sensor(light, stopped_down).full_well for _ in range(50)]
         assert all(125 <= well <= 250 for well in wells if well is not None)
 
     def test_feature_read_noise_is_uniform_in_its_logarithm(self, monkeypatch):
         monkeypatch.setattr("kornia_tidy.training.noisy_crops.SHOT_SHARE", 0.0)
         torch.manual_seed(0)
-        place = [math.log(random_sensor((1e-3, 0.03)).sigma / 1e-3, 30) for _ in range(2000)]
+        place = [math.log(random_sensor(LightSettings(), ThinLensCamera()).sigma / 1e-3, 30) for _ in range(2000)]
         # Kolmogorov-Smirnov: a uniform sample of 2000 deviates by more than 0.044 once in a thousand.
         assert np.abs(np.sort(place) - np.linspace(0, 1, 2000)).max() < 0.044
 
@@ -235,11 +246,12 @@ class TestNoisyCrops(BaseTester):
 
     def test_exception_values_that_are_not_allowed(self, leaves):
         captures, optics = leaves
-        with pytest.raises(ValueError, match="noise_range must be 0 < least <= largest < 1 of full scale, got 0 and"):
-            NoisyCrops(captures, optics, 8, (0, 0.1))
-        with pytest.raises(ValueError, match="electrons must be 0 < least <= largest, got 9 and 2"):
-            NoisyCrops(captures, optics, 8, electrons=(9, 2))
-        with pytest.raises(ValueError, match="noise_error must be a factor of at least 1, got nan"):
-            NoisyCrops(captures, optics, 8, noise_error=float("nan"))
+        for light, message in (
+            (LightSettings(noise_range=(0, 0.1)), "noise_range must be a number above 0, got 0"),
+            (LightSettings(electrons=(9, 2)), "electrons must be least and largest, got 9 and 2"),
+            (LightSettings(noise_error=float("nan")), "noise_error must be"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                NoisyCrops(captures, optics, 8, light)
         with pytest.raises(ValueError, match="the crop must not exceed the captures of 32 x 32 pixels, got 33"):
             NoisyCrops(captures, optics, 33)[0]

@@ -77,20 +77,8 @@ class Simulate:
     file: DepthFile = field(default_factory=DepthFile)
 
     basic: ClassVar = (
-        *(
-            "image",
-            "depth",
-            "output",
-            "seed",
-            "noise",
-            "holes",
-            "fidelity",
-            "compositing",
-            "masks",
-            "mask_seed",
-            "psfs",
-        ),
-        *("focal_length", "f_number", "focus_distance", "depth_range", "pixel_pitch", "fit_depth", "lens"),
+        *("image", "depth", "output", "seed", "noise", "holes", "fidelity", "compositing", "masks", "mask_seed"),
+        *("psfs", "focal_length", "f_number", "focus_distance", "depth_range", "pixel_pitch", "fit_depth", "lens"),
         "depth_scale",
     )
 
