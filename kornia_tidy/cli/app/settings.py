@@ -53,20 +53,18 @@ class Control:
         name: of the setting.
         default: of the setting.
         label: with its unit.
-        kind: of the control.
         group: of the page.
         info: explanation.
         choices: labels and values.
         low: smallest number, in the unit of the label.
         high: largest number.
-        step: of a slider.
+        step: of a slider; other numbers are typed.
         per_unit: power of ten from the unit in the label to that of the setting: -3 for millimetres and metres.
     """
 
     name: str
     default: Any
     label: str
-    kind: Kind
     group: Group
     info: str = ""
     choices: Sequence[tuple[str, Any]] = ()
@@ -74,6 +72,17 @@ class Control:
     high: float | None = None
     step: float | None = None
     per_unit: int = 0
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the control."""
+        if self.choices:
+            return "choice"
+        if self.low is None:
+            return "file" if self.default is None else "check"
+        if self.step is not None:
+            return "slider"
+        return "whole" if isinstance(self.default, int) else "number"
 
     @property
     def value(self) -> Any:
@@ -168,9 +177,10 @@ CHOICES: dict[str, Sequence[tuple[str, Any]]] = {
 """Labels and values."""
 
 
-def _control(default: Any, label: str, kind: Kind, group: Group, **limits: Any) -> Any:
-    """Return the field of a setting with its control."""
-    return field(default=default, metadata={"label": label, "kind": kind, "group": group, **limits})
+def _control(default: Any, label: str, group: Group, *limits: float, per_unit: int = 0) -> Any:
+    """Return the field of a setting with its control; limits are ``low``, ``high`` and ``step``."""
+    limited = dict(zip(("low", "high", "step"), limits, strict=False))
+    return field(default=default, metadata={"label": label, "group": group, "per_unit": per_unit, **limited})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,52 +227,31 @@ class Settings:
         ValueError: Read noise (% of full scale): give a number from 0 to 5, got -100
     """
 
-    scene: str = _control("dead leaves", "Scene", "choice", "scene")
-    image_file: str | None = _control(None, "Photo (PNG, TIFF, JPEG)", "file", "files")
-    depth_file: str | None = _control(
-        None, "Its depth map (16-bit PNG, TIFF, PGM, PFM, NPY, NPZ, OpenEXR)", "file", "files"
-    )
-    depth_scale: float = _control(1.0, "Unit of the depth map", "choice", "files")
-    seed: int = _control(0, "Number of the painted scene", "whole", "painted scene", low=0, high=SEEDS - 1)
-    camera: str = _control("joint-uncertain", "Camera", "choice", "camera")
-    f_number: float = _control(round(LENS.f_number, 1), "f-number", "slider", "own camera", low=2, high=32, step=0.1)
-    focus_distance: float = _control(
-        float(LENS.focus_distance), "Focus distance (m)", "number", "own camera", low=0.06, high=1000
-    )
-    fit: bool = _control(False, "Choose aperture and focus for the scene", "check", "own camera")
-    focal_length: float = _control(
-        LENS.focal_length, "Focal length (mm)", "number", "own camera", low=1, high=1000, per_unit=-3
-    )
-    lens: str = _control(IDEAL, "Lens", "choice", "own camera")
+    scene: str = _control("dead leaves", "Scene", "scene")
+    image_file: str | None = _control(None, "Photo (PNG, TIFF, JPEG)", "files")
+    depth_file: str | None = _control(None, "Its depth map (16-bit PNG, TIFF, PGM, PFM, NPY, NPZ, OpenEXR)", "files")
+    depth_scale: float = _control(1.0, "Unit of the depth map", "files")
+    seed: int = _control(0, "Number of the painted scene", "painted scene", 0, SEEDS - 1)
+    camera: str = _control("joint-uncertain", "Camera", "camera")
+    f_number: float = _control(round(LENS.f_number, 1), "f-number", "own camera", 2, 32, 0.1)
+    focus_distance: float = _control(float(LENS.focus_distance), "Focus distance (m)", "own camera", 0.06, 1000)
+    fit: bool = _control(False, "Choose aperture and focus for the scene", "own camera")
+    focal_length: float = _control(LENS.focal_length, "Focal length (mm)", "own camera", 1, 1000, per_unit=-3)
+    lens: str = _control(IDEAL, "Lens", "own camera")
     place: float = _control(
-        0.0,
-        "Place of the picture in a real lens's field (%)",
-        "slider",
-        "own camera",
-        low=0,
-        high=100,
-        step=5,
-        per_unit=-2,
+        0.0, "Place of the picture in a real lens's field (%)", "own camera", 0, 100, 5, per_unit=-2
     )
-    pixel_pitch: float = _control(
-        LENS.pixel_pitch, "Pixel pitch (µm)", "number", "own camera", low=0.5, high=50, per_unit=-6
-    )
-    start: str = _control("like fishers", "Masks", "choice", "own camera")
-    masks: int = _control(
-        MaskSettings.masks, "Masks in one exposure, K", "slider", "own camera", low=1, high=MOST_MASKS, step=1
-    )
-    compositing: str = _control(AS_SYSTEM, "Compositing at depth edges", "choice", "capture")
-    noise: float = _control(
-        0.002, "Read noise (% of full scale)", "slider", "capture", low=0, high=5, step=0.05, per_unit=-2
-    )
-    stretch: bool = _control(True, "Stretch the depths over the camera's range", "check", "more")
-    near: float = _control(0.3, "Nearest painted depth (m)", "number", "painted depths", low=0.05, high=1000)
-    far: float = _control(10.0, "Farthest painted depth (m)", "number", "painted depths", low=0.05, high=10000)
-    side: int = _control(
-        320, "Longer side of the picture (pixels)", "slider", "more", low=SIDES[0], high=SIDES[1], step=32
-    )
-    mask_seed: int = _control(0, "Seed of random masks", "whole", "more", low=0, high=SEEDS - 1)
-    noise_seed: int = _control(0, "Seed of the sensor's noise", "whole", "more", low=0, high=SEEDS - 1)
+    pixel_pitch: float = _control(LENS.pixel_pitch, "Pixel pitch (µm)", "own camera", 0.5, 50, per_unit=-6)
+    start: str = _control("like fishers", "Masks", "own camera")
+    masks: int = _control(MaskSettings.masks, "Masks in one exposure, K", "own camera", 1, MOST_MASKS, 1)
+    compositing: str = _control(AS_SYSTEM, "Compositing at depth edges", "capture")
+    noise: float = _control(0.002, "Read noise (% of full scale)", "capture", 0, 5, 0.05, per_unit=-2)
+    stretch: bool = _control(True, "Stretch the depths over the camera's range", "more")
+    near: float = _control(0.3, "Nearest painted depth (m)", "painted depths", 0.05, 1000)
+    far: float = _control(10.0, "Farthest painted depth (m)", "painted depths", 0.05, 10000)
+    side: int = _control(320, "Longer side of the picture (pixels)", "more", *SIDES, 32)
+    mask_seed: int = _control(0, "Seed of random masks", "more", 0, SEEDS - 1)
+    noise_seed: int = _control(0, "Seed of the sensor's noise", "more", 0, SEEDS - 1)
 
     @property
     def painted_size(self) -> tuple[int, int]:
