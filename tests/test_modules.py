@@ -36,7 +36,6 @@ ARGUMENTS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "Lens": lambda: made_lenses.ideal_parts("own", "", lambda *x: 0 * x[2], (530e-9,), 50e-3, 8.0, 1.0, 7e-3),
     "LinearCamera": lambda: (TiDyOptics(sensor=None), torch.ones(1, 1, 40, 40)),
     "PixelCrosstalk": lambda: (0.3,),
-    "Preconditioned": lambda: (network(),),
     "Residual": lambda: (network(),),
     "SelfEnsemble": lambda: (network(),),
     "StrokeError": lambda: (0.9,),

@@ -41,7 +41,7 @@ class Switching(Modulator):
     * ``"linear"``: :math:`\phi_k + u (\phi_{k+1} - \phi_k)`;
     * ``"exponential"``: the same with :math:`1 - e^{-u t/\tau} = 1 - 0.01^u` for u. This is the first-order relaxation
       of a liquid crystal, 99 % complete at the end of the transition, :math:`t = 4.6 \tau`; the last 1 % is neglected.
-      A data sheet's rise time from 10 to 90 % is :math:`2.2 \tau`, see :func:`settling_time`;
+      A data sheet's rise time from 10 to 90 % is :math:`\ln 9 \, \tau`, so :math:`t = 2.1 \, t_{10-90}`;
     * a measured response for u, as samples evenly spaced over the transition and linear between. It starts at 0 and
       ends at 1; overshoot is allowed.
 
@@ -163,28 +163,6 @@ class Switching(Modulator):
             f"{self.switching_time * 1e3:g} ms a transition in an exposure of {self.exposure * 1e3:g} ms, "
             f"{between} between{', cyclic' if self.cyclic else ''}"
         )
-
-
-def settling_time(rise_time: float) -> float:
-    r"""Return the switching time of a first-order liquid crystal from its rise time.
-
-    .. math:: t = \frac{\ln 100}{\ln 9} \, t_{10-90}
-
-    Args:
-        rise_time: from 10 to 90 % of a step, in seconds, as data sheets quote it.
-
-    Returns:
-        Seconds until the step is 99 % complete.
-
-    Raises:
-        ValueError: if the rise time is not positive and finite.
-
-    Example:
-        >>> round(settling_time(5e-3), 5)
-        0.01048
-    """
-    check_positive("rise_time", rise_time, "seconds")
-    return rise_time * math.log(1 / (1 - SETTLED)) / math.log(9)
 
 
 def sampled_response(between: str | Sequence[float], samples: int) -> tuple[Tensor, Tensor]:

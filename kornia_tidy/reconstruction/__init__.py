@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from kornia_tidy.reconstruction.restored_over_field import restored_over_field
     from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
     from kornia_tidy.reconstruction.self_ensemble import SelfEnsemble, self_ensemble
-    from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers
+    from kornia_tidy.reconstruction.tikhonov import Tikhonov, TikhonovLayers
     from kornia_tidy.reconstruction.tiled import reconstruct_tiled
     from kornia_tidy.reconstruction.wiener import Wiener
 
@@ -45,7 +45,6 @@ __all__ = [
     "MiDaSSmall",
     "NAFNet",
     "PhaseCam3DUNet",
-    "Preconditioned",
     "ReconstructionHead",
     "Refocused",
     "Residual",

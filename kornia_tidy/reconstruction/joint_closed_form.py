@@ -112,10 +112,6 @@ class JointClosedFormHead(ClosedFormHead):
             logits = smoothed_classes(logits, image) / self.temperature.to(logits.dtype)
         return torch.cat([logits, image], 1)
 
-    def closed_form_logits(self, capture: Tensor, noise: Tensor | float | None = None) -> Tensor:
-        """Return the logits of the classes by only the likelihood in closed form, (B, D, H, W)."""
-        return self._initial_logits(self.closed_form(capture, noise).maps)
-
     def _initial_logits(self, maps: Tensor) -> Tensor:
         """Return the logarithm of the likelihood for each class, from the maps of the closed form."""
         return interpolated_classes(LEAST * (1 - maps[:, -self.closed_form.layers :]), self.out_channels - 3)

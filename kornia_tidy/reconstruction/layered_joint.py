@@ -173,10 +173,6 @@ class LayeredJointHead(ReconstructionHead):
             logits = logits / self.temperature.to(logits.dtype)
         return torch.cat([logits, refined.to(logits.dtype)], 1)
 
-    def closed_form_logits(self, light: Tensor) -> Tensor:
-        """Return the logits of the classes by only the likelihood in closed form, from linear light (B, 3, H, W)."""
-        return interpolated_classes(self._fits(light), self.out_channels - 3)
-
     def _fits(self, light: Tensor) -> Tensor:
         """Return how well each layer fits, (B, L, H, W), from ``LEAST`` to 0."""
         fits = depth_likelihood(light.mean(1, keepdim=True), self.whitening, self.log_determinants)

@@ -72,7 +72,7 @@ class Refocused(ReconstructionHead):
           training they are computed for every batch, and gradients also reach the masks through them.
 
     Source: Ikoma et al., Depth from Defocus with Learned Optics (ICCP 2021), for a network behind the layers of a
-    closed form. :class:`~kornia_tidy.reconstruction.tikhonov.Preconditioned` does this exactly, in linear light, with
+    closed form. :class:`~kornia_tidy.reconstruction.tikhonov.TikhonovLayers` gives them exactly, in linear light, by
     filters as large as the picture.
 
     Example:

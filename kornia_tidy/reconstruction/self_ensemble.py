@@ -110,16 +110,6 @@ def self_ensemble(head: nn.Module, orientations: int = 8) -> nn.Module:
     return copied
 
 
-def takes_orientations(head: nn.Module) -> bool:
-    """Return whether the networks of a head may be averaged over orientations: whether it begins with the closed form.
-
-    Example:
-        >>> takes_orientations(ClosedFormHead()), takes_orientations(nn.Conv2d(3, 3, 1))  # both without a network
-        (False, False)
-    """
-    return bool(_refining(head))
-
-
 def check_orientations(orientations: int) -> None:
     """Raise ``ValueError`` for a number of orientations that is not offered."""
     if orientations not in ORIENTATIONS:

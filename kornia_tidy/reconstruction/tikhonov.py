@@ -201,37 +201,6 @@ class TikhonovLayers(Inversion):
         return tikhonov_layers(capture, self._psfs(bank), self.weight, veil=bank.veil, border=self.border)
 
 
-class Preconditioned(nn.Module):
-    """Feeds a network the capture together with the estimates of an inversion.
-
-    Args:
-        network: takes (B, C + C D, H, W): the capture, then the estimates in the order of the bank's layers; with
-            :class:`Tikhonov` it takes (B, 2 C, H, W).
-        inversion: of the capture. Default: :class:`TikhonovLayers`, as in Ikoma et al.
-
-    Shape:
-        - ``(capture, bank)``: (B, C, H, W) linear light and a bank of D layers, to the network's output.
-
-    Source: Ikoma et al., Depth from Defocus with Learned Optics, ICCP 2021.
-
-    Example:
-        >>> bank = PSFBank.from_measured(torch.rand(4, 3, 5, 5), torch.arange(4.0))
-        >>> head = Preconditioned(nn.Conv2d(3 + 3 * 4, 1, 3, padding=1))
-        >>> head(torch.rand(2, 3, 16, 20), bank).shape
-        torch.Size([2, 1, 16, 20])
-    """
-
-    def __init__(self, network: nn.Module, inversion: Inversion | None = None) -> None:
-        super().__init__()
-        self.inversion = TikhonovLayers() if inversion is None else inversion
-        self.network = network
-
-    def forward(self, capture: Tensor, bank: PSFBank) -> Tensor:
-        """Return the network's output for capture and estimates."""
-        estimates = self.inversion(capture, bank).flatten(1, -3)
-        return self.network(torch.cat([capture, estimates], dim=1))
-
-
 def transfer_function(psfs: Tensor, size: tuple[int, int], veil: Tensor | None = None) -> Tensor:
     r"""Return the half spectrum of PSFs on a periodic plane, with the chief ray on its first pixel.
 

@@ -21,9 +21,10 @@ from typing import Any
 import torch
 
 from kornia_tidy.files import write_bytes
-from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, about_pretrained, ship
+from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, about_pretrained
 from kornia_tidy.training.callbacks import BEST
 from kornia_tidy.training.settings import TrainingSettings
+from tests.benchmarks.shipped_files import ship
 from tests.benchmarks.system_scores import score
 
 COMMANDS, MACHINE, SCORES = "commands.txt", "machine.txt", "scores.json"

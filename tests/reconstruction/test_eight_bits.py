@@ -5,9 +5,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.reconstruction.eight_bits import LEVELS, EightBits, in_eight_bits
+from kornia_tidy.reconstruction.eight_bits import EightBits
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from tests.base import BaseTester
+from tests.benchmarks.shipped_files import LEVELS, in_eight_bits
 
 ROUNDING = 2.0**-24  # relative error of float32
 LEAST = 2.0**-126  # smaller numbers have fewer digits

@@ -62,10 +62,15 @@ def image_head(kind, layers):
     return head
 
 
+def initial_logits(head, capture, noise):
+    """The logits of the classes by only the likelihood in closed form."""
+    return head._initial_logits(head.closed_form(capture, noise).maps)
+
+
 def blended(head, capture, noise):
     """Return the deconvolved depths blended by the likelihood of the classes in closed form, and smoothed."""
     layers = head.closed_form(capture, noise).layers
-    shares = layer_weights(head.closed_form_logits(capture, noise), LAYERS)
+    shares = layer_weights(initial_logits(head, capture, noise), LAYERS)
     return head.closed_form.blend(layers, shares, torch.full_like(capture, noise))
 
 
@@ -76,7 +81,7 @@ class TestJointClosedFormHead(BaseTester):
         with torch.no_grad():
             output = head(capture, 0.01)
             padded = functional.pad(capture, (7, 8, 6, 6), "reflect")
-            image, likelihood = blended(head, padded, 0.01), head.closed_form_logits(padded, 0.01)
+            image, likelihood = blended(head, padded, 0.01), initial_logits(head, padded, 0.01)
         assert output.shape == (2, CLASSES + 3, 20, 33)
         assert torch.equal(output[:, -3:], image[..., 6:26, 7:40])
         assert torch.equal(output[:, :CLASSES], smoothed_classes(likelihood, image)[..., 6:26, 7:40])
@@ -183,7 +188,7 @@ class TestJointClosedFormHead(BaseTester):
         assert not begun[:, trained.shape[1] :].any()
         with torch.no_grad():
             self.assert_close(head(capture, 0.01)[:, -3:], blended(head, capture, 0.01))
-            self.assert_close(head.train()(capture, 0.01)[:, :CLASSES], head.closed_form_logits(capture, 0.01))
+            self.assert_close(head.train()(capture, 0.01)[:, :CLASSES], initial_logits(head, capture, 0.01))
 
     @pytest.mark.parametrize("kind", [NAFNet, PlainHead])
     @pytest.mark.parametrize("layers", [0, LAYERS])

@@ -21,12 +21,12 @@ from kornia_tidy.reconstruction.pretrained import (
     load_pretrained,
     pretrained_record,
     pretrained_settings,
-    ship,
 )
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.trained import load_trained, load_weights
 from kornia_tidy.training.evaluation import evaluate, mean_row
 from tests.base import BaseTester
+from tests.benchmarks.shipped_files import ship
 
 MEGABYTES = 25  # that all of them may take
 

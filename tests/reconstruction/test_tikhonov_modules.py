@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import nn
 
 from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import Wiener
-from kornia_tidy.reconstruction.tikhonov import Preconditioned, Tikhonov, TikhonovLayers, tikhonov, tikhonov_layers
+from kornia_tidy.reconstruction.tikhonov import Tikhonov, TikhonovLayers, tikhonov, tikhonov_layers
 from tests.base import BaseTester
 from tests.reconstruction.banks import make_bank, make_psfs
 
@@ -45,15 +44,6 @@ class TestModules(BaseTester):
         assert inversion.weight > 0
         assert inversion(torch.rand(1, 2, 8, 8, device=device), bank).isfinite().all()
         assert list(inversion.state_dict()) == ["log_weight"]
-
-    def test_feature_a_network_sees_the_capture_and_then_the_layers_in_order(self, device):
-        capture, bank = torch.rand(2, 2, 9, 8, device=device), make_bank(device=device, dtype=torch.float32)
-        seen = Preconditioned(nn.Identity())(capture, bank)
-        assert seen.shape == (2, 2 + 3 * 2, 9, 8)
-        layers = TikhonovLayers(1.0)(capture, bank)
-        assert torch.equal(seen, torch.cat([capture, layers[:, 0], layers[:, 1], layers[:, 2]], dim=1))
-        seen = Preconditioned(nn.Identity(), Tikhonov())(capture, bank)
-        assert torch.equal(seen, torch.cat([capture, Tikhonov()(capture, bank)], dim=1))
 
     @pytest.mark.parametrize("module", [Tikhonov, TikhonovLayers])
     def test_exception_of_the_constructor(self, module):

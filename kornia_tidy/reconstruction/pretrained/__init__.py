@@ -6,15 +6,13 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.choices import PRETRAINED, REPLACED
-from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.settings import SystemSettings
-from kornia_tidy.reconstruction.state_file import read_state, write_state
+from kornia_tidy.reconstruction.state_file import read_state
 from kornia_tidy.reconstruction.trained import TrainedSystem, load_trained
 
 FOLDER = Path(__file__).parent
@@ -87,32 +85,3 @@ def pretrained_record(name: str) -> dict[str, Any]:
     check_shipped(name)
     about = about_pretrained()
     return {**{key: about[key] for key in ("command", "date", "commit", "machine", "torch")}, **about["systems"][name]}
-
-
-def ship(checkpoint: str | os.PathLike[str], path: str | os.PathLike[str], *, short: bool = True) -> None:
-    """Write a checkpoint for shipping: without the state of the run, the network's weights in eight bits.
-
-    PSFs of a closed form are left out: :func:`~kornia_tidy.reconstruction.trained.load_trained` computes them anew. So
-    is the folder of the data, a place on one machine.
-
-    Args:
-        checkpoint: file that ``kornia-tidy train`` wrote with a moving average.
-        path: of the new file.
-        short: write the network's weights as :func:`~kornia_tidy.reconstruction.eight_bits.in_eight_bits` rounds them.
-            They are loaded as float32. False: they do not change.
-
-    Raises:
-        ValueError: if it is not a checkpoint, has no moving average, or a weight is not finite or too large.
-    """
-    state = read_state(checkpoint)
-    wanted = ("optics.", "average.network.")
-    weights = {name: value for name, value in state["state_dict"].items() if name.startswith(wanted)}
-    if not any(name.startswith(wanted[1]) for name in weights):
-        raise ValueError(f"{checkpoint} holds no moving average of its network: train it with ema above 0")
-    if short:
-        parameters = load_trained(checkpoint).head.named_parameters()
-        weights = in_eight_bits(weights, [f"{wanted[1]}{name}" for name, _ in parameters])
-    weights |= {name: value[..., :0, :0] for name, value in weights.items() if name.endswith("closed_form.psfs")}
-    settings = {name: None if name == "root" else value for name, value in state["settings"].items()}
-    kept = {name: state[name] for name in ("global_step", "psfs") if name in state}
-    write_state(path, {"settings": settings, "state_dict": weights, **kept})

@@ -25,7 +25,6 @@ from kornia_tidy.reconstruction import RuledClosedForm
 from kornia_tidy.reconstruction.any_camera import any_camera_head, corrected, largest_share
 from kornia_tidy.reconstruction.capture_checks import JPEG_NOISE
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
-from kornia_tidy.reconstruction.eight_bits import in_eight_bits
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.seeds import keyed_seed
@@ -34,6 +33,7 @@ from kornia_tidy.training.noisy_crops import random_gain
 from kornia_tidy.training.task_loss import psnr_ssim_loss
 from tests.benchmarks.any_camera.cameras import camera, local_bank, own_system, pool_names
 from tests.benchmarks.any_camera.captures import LEVELS, stored
+from tests.benchmarks.shipped_files import in_eight_bits
 
 CROP = 128  # px
 CAMERAS_A_STEP, CROPS_A_CAMERA = 3, 2

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from kornia_tidy.reconstruction import Wiener, head
+from kornia_tidy.reconstruction import ClosedFormHead, Wiener, head
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
-from kornia_tidy.reconstruction.self_ensemble import self_ensemble, takes_orientations
+from kornia_tidy.reconstruction.self_ensemble import self_ensemble
 from kornia_tidy.reconstruction.tasks import MAPS, depth_logits, split_maps
 from kornia_tidy.reconstruction.tikhonov import tikhonov
 from tests.benchmarks.results.captures import Capture, encode
@@ -114,7 +114,7 @@ def restorations_for(system: System) -> dict[str, Restoration]:
         found[NETWORK] = _network()
         if takes_noise(system):
             found |= {f"{NETWORK}, noise x {factor:g}": _network(factor) for factor in (0.5, 2.0)}
-        if takes_orientations(system.head):
+        if any(isinstance(part, ClosedFormHead) and part.network is not None for part in system.head.modules()):
             found[ENSEMBLE] = _network(orientations=8)
     return found
 
