@@ -54,7 +54,7 @@ class BatchedBackend:
     def render(self, scene: LayeredScene) -> Tensor:
         """Return the rendered light, for occlusion in float64 where the device has it."""
         if scene.compositing == "occlusion":
-            return occlude_parts(occlusion_planes(scene), self.parts(scene), self._most_bytes(scene))
+            return occlude_parts(occlusion_planes(scene), self.parts(scene))
         sums = LayerBatches(scene, self.parts(scene))
         return sums.gather(scene.plane) if scene.compositing == "gather" else seen(scene, sums.scatter(scene.plane))
 
@@ -62,7 +62,7 @@ class BatchedBackend:
         """Return the gradients of the planes, of the PSFs and of the layers' weights."""
         if scene.compositing != "occlusion":
             return blend_gradients(scene, LayerBatches(scene, self.parts(scene)), gradient)
-        return part_gradients(occlusion_planes(scene), self.parts(scene), gradient, self._most_bytes(scene))
+        return part_gradients(occlusion_planes(scene), self.parts(scene), gradient)
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work, on a processor with the layers in every eighth row and column of the tiles."""
@@ -129,7 +129,7 @@ class BatchedBackend:
         )
         layers, together, images = min(every, _LAYERS) if here else every, channels, 1
         if _is_whole(scene):
-            images = batch if occludes else max(1, most // (every * channels * one))
+            images = max(1, most // (every * channels * one))
         elif not occludes and _PLANES * layers * channels * one > most:
             together = 1
         if here:
