@@ -26,7 +26,7 @@ def weight_of_layer(layer_index: Tensor, layer_weight: Tensor | None, layer: int
     """
     if layer_weight is None:
         return layer_index == layer
-    return torch.where(layer_index == layer, 1 - layer_weight, torch.where(layer_index == layer - 1, layer_weight, 0))
+    return torch.where(layer_index == layer, 1 - layer_weight, layer_weight * (layer_index == layer - 1))
 
 
 def layer_weights(defocus: Tensor, nodes: Tensor, mode: str) -> Tensor:
