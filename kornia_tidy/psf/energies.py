@@ -23,7 +23,7 @@ Source: Goodman, Statistical Optics, 5.2, for the mutual intensity.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -252,24 +252,27 @@ def _real_rows(numbers: Tensor) -> Tensor:
 def _in_block(energies: Callable[..., Tensor], *given: Tensor) -> Tensor:
     """Return the energies of a block; the backward pass keeps only the inputs."""
     with torch.autocast(given[0].device.type, enabled=False):
-        return energies(*given) if torch_mode() & Mode.TRACED else _MadeAgain.apply(energies, *given)
+        return energies(*given) if torch_mode() & Mode.TRACED else made_again(energies, None, *given)
+
+
+def made_again(function: Callable[..., Tensor], known: Tensor | None, *given: Tensor) -> Tensor:
+    """Return a function's values; the backward pass computes it again. Where they are known, only that does."""
+    return cast("Tensor", _MadeAgain.apply(function, known, *given))
 
 
 class _MadeAgain(torch.autograd.Function):
-    """A function that the backward pass computes again."""
-
     @staticmethod
-    def forward(ctx: Any, function: Callable[..., Tensor], *given: Tensor) -> Tensor:
+    def forward(ctx: Any, function: Callable[..., Tensor], known: Tensor | None, *given: Tensor) -> Tensor:
         ctx.function = function
         ctx.save_for_backward(*given)
-        return function(*given)
+        return function(*given) if known is None else known.clone()
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        wanted, twice = ctx.needs_input_grad[1:], torch.is_grad_enabled()
+        wanted, twice = ctx.needs_input_grad[2:], torch.is_grad_enabled()
         with torch.enable_grad(), torch.autocast(gradients[0].device.type, enabled=False):
             given = zip(ctx.saved_tensors, wanted, strict=True)
             own = [x.view_as(x) if twice else x.detach().requires_grad_(want) for x, want in given]
             asked = [x for x, want in zip(own, wanted, strict=True) if want]
             found = iter(torch.autograd.grad(ctx.function(*own), asked, gradients, create_graph=twice))
-        return None, *(next(found) if want else None for want in wanted)
+        return None, None, *(next(found) if want else None for want in wanted)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from kornia_tidy.psf.energies import made_again
 from kornia_tidy.psf.geometric_psf import blur_radius, geometric_psfs
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_cache import present_intervals
@@ -83,39 +84,20 @@ def learnt_bank(bank: PSFBank, exact: Exact, states: Tensor, weights: Tensor, gr
     Raises:
         RuntimeError: in the backward pass, if PSFs are wider than :data:`MOST_LEARNT`.
     """
-    nodes = tuple(bank.defocus.tolist())
-    psfs: Any = _ExactGradient.apply(states, weights, bank.psfs, exact, nodes, grid)
-    return PSFBank(psfs, bank.defocus, psfs.sum((2, 3)))
+    window = bank.window
 
-
-class _ExactGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, states: Tensor, weights: Tensor, psfs: Tensor, exact: Exact, nodes: tuple[float, ...], grid: int
-    ) -> Tensor:
-        ctx.save_for_backward(states, weights)
-        ctx.exact, ctx.nodes, ctx.grid = exact, nodes, grid
-        return psfs.clone()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
-        (gradient,), saved = grad_outputs, ctx.saved_tensors
-        if (side := gradient.shape[-1] * ctx.grid) > MOST_LEARNT:
+    def depth(psi: float, states: Tensor, weights: Tensor) -> Tensor:
+        if window * grid > MOST_LEARNT:
             raise RuntimeError(
-                f"gradients of masks are computed through PSFs of at most {MOST_LEARNT} px, got {side} px: freeze the "
-                f"masks by masks.requires_grad_(False), or take a smaller aperture or a narrower depth_range"
+                f"gradients of masks are computed through PSFs of at most {MOST_LEARNT} px, got {window * grid} px: "
+                f"freeze the masks by masks.requires_grad_(False), or take a smaller aperture or a narrower depth_range"
             )
-        wanted = [i for i in (0, 1) if ctx.needs_input_grad[i]]
-        total = [torch.zeros_like(x) for x in saved]
-        for psi, own in zip(ctx.nodes, gradient, strict=True):  # one depth at a time: waves of large windows are large
-            with torch.enable_grad():
-                leaves = [x.detach().requires_grad_(i in wanted) for i, x in enumerate(saved)]
-                psfs = ctx.exact(*leaves, (psi,), gradient.shape[-1]).psfs
-                found = torch.autograd.grad(psfs, [leaves[i] for i in wanted], own[None], allow_unused=True)
-            for i, value in zip(wanted, found, strict=True):
-                total[i] = total[i] if value is None else total[i] + value
-        return *(x if i in wanted else None for i, x in enumerate(total)), None, None, None, None
+        return exact(states, weights, (psi,), window).psfs
+
+    # One depth at a time: waves of large windows are large.
+    depths = zip(bank.defocus.tolist(), bank.psfs.split(1), strict=True)
+    psfs = torch.cat([made_again(partial(depth, psi), own, states, weights) for psi, own in depths])
+    return PSFBank(psfs, bank.defocus, psfs.sum((2, 3)))
 
 
 def is_flat(states: Tensor) -> bool:

@@ -28,8 +28,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
+from kornia_tidy.psf.psf_bank import BankOfPSFs
 from kornia_tidy.render.borders import cropped, extended, next_fast_size
-from kornia_tidy.render.compositing import Bank, gather
+from kornia_tidy.render.compositing import gather
 from kornia_tidy.render.scene import assign_layers
 
 _SHARPENED = 1 / 6  # half of the variance that averaging and interpolating add on each axis
@@ -37,7 +38,7 @@ _LAYER_BYTES = 64 << 20  # of the layers held at a time
 
 
 def gather_group(
-    image: Tensor, defocus: Tensor, bank: Bank, own: Tensor, grid: int, margin: int = 0, border: str = "reflect"
+    image: Tensor, defocus: Tensor, bank: BankOfPSFs, own: Tensor, grid: int, margin: int = 0, border: str = "reflect"
 ) -> Tensor:
     """Gather light through a group of layers on one grid, at the pixels that are the group's.
 
@@ -70,18 +71,18 @@ def gather_group(
     return coded
 
 
-def _on_sensor(image: Tensor, seen: Tensor, bank: Bank, margin: int, border: str) -> Tensor:
+def _on_sensor(image: Tensor, seen: Tensor, bank: BankOfPSFs, margin: int, border: str) -> Tensor:
     """Gather on the sensor's own pixels, after as much border as the PSFs reach."""
-    radius, nodes = bank.psfs.shape[-1] // 2, bank.defocus
+    radius = bank.window // 2
     height, width = seen.shape[-2:]
     rows, columns = ((margin - radius, side + margin + radius) for side in (height, width))
     plane = extended(image, rows, columns, border)
     beyond = pad(seen, (radius,) * 4)  # not looked at
-    return gather(plane, beyond, nodes, bank.psfs, border="valid")
+    return gather(plane, beyond, bank.defocus, bank.psfs, border="valid")
 
 
 def _on_grid(
-    image: Tensor, seen: Tensor, own: Tensor, bank: Bank, grid: int, margin: int, border: str
+    image: Tensor, seen: Tensor, own: Tensor, bank: BankOfPSFs, grid: int, margin: int, border: str
 ) -> Iterator[tuple[int, Tensor, Tensor]]:
     """Yield images of the batch, pixels (n,) of the group and their light (C, n), some layers at a time."""
     radius = bank.psfs.shape[-1] // 2 + 2  # one for interpolation, one for sharpening

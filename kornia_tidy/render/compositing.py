@@ -7,36 +7,18 @@ Each function makes a layered scene of its arguments (:mod:`kornia_tidy.render.s
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from torch import Tensor
 
+from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.render.dispatch import render_layers
-
-
-class Bank(Protocol):
-    """The part of a PSF bank that the renderer reads. D layers, C channels, PSFs of P x P pixels with P odd."""
-
-    @property
-    def psfs(self) -> Tensor:
-        """(D, C, P, P) fraction of a point's light that falls on each pixel."""
-        ...
-
-    @property
-    def defocus(self) -> Tensor:
-        """(D,) defocus of the layers in radians, ascending."""
-        ...
-
-    @property
-    def veil(self) -> Tensor | None:
-        """(D, C) fraction of light that leaves the window and is spread evenly, or None for none."""
-        ...
 
 
 def render(
     image: Tensor,
     defocus: Tensor,
-    bank: Bank,
+    bank: PSFBank,
     compositing: str = "gather",
     *,
     layers: str = "linear",
@@ -49,7 +31,7 @@ def render(
     Args:
         image: (B, C, H, W) linear light of the scene, with the channels of the bank.
         defocus: (B, 1, H, W) or (1, 1, H, W) defocus in radians. Beyond the bank's layers it is clamped to the ends.
-        bank: PSFs and their defocus, see :class:`Bank`.
+        bank: PSFs and their defocus, a :class:`~kornia_tidy.psf.PSFBank`.
         compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``, see the functions of these names.
         layers: ``"linear"`` or ``"nearest"``, see :func:`kornia_tidy.render.layers.assign_layers`.
         border: ``"reflect"``, ``"replicate"``, ``"zero"``, ``"circular"`` or ``"valid"``, see
@@ -73,8 +55,7 @@ def render(
 
     Example:
         >>> import torch
-        >>> from types import SimpleNamespace
-        >>> bank = SimpleNamespace(psfs=torch.full((2, 3, 5, 5), 1 / 25), defocus=torch.tensor([-9.0, 9.0]), veil=None)
+        >>> bank = PSFBank(torch.full((2, 3, 5, 5), 1 / 25), torch.tensor([-9.0, 9.0]), torch.ones(2, 3))
         >>> render(torch.rand(4, 3, 32, 48), torch.zeros(1, 1, 32, 48), bank, border="valid").shape
         torch.Size([4, 3, 28, 44])
     """

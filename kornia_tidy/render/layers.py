@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.mode import Mode, torch_mode
-from kornia_tidy.render.scene import assign_layers
+from kornia_tidy.render.scene import Labels, assign_layers
 
 
 def weight_of_layer(layer_index: Tensor, layer_weight: Tensor | None, layer: int | Tensor) -> Tensor:
@@ -95,11 +95,4 @@ def present_layers(layer_index: Tensor, layer_weight: Tensor | None, count: int)
     """
     if Mode.TRANSFORM in torch_mode():
         return list(range(count))
-    present = torch.zeros(count, dtype=torch.bool, device=layer_index.device)
-    if layer_weight is None:
-        present[layer_index] = True
-        return [layer for layer, here in enumerate(present.tolist()) if here]
-    next_layer, with_gradient = layer_index + 1, layer_weight.requires_grad
-    present[layer_index if with_gradient else torch.where(layer_weight < 1, layer_index, next_layer)] = True
-    present[next_layer if with_gradient else torch.where(layer_weight > 0, next_layer, layer_index)] = True
-    return [layer for layer, here in enumerate(present.tolist()) if here]
+    return Labels(layer_index, layer_weight, layer_weight is not None and layer_weight.requires_grad).present()

@@ -56,6 +56,10 @@ class Labels:
         weight = self.layer_weight[where]
         return [index + (weight == 1), index + (weight > 0)]
 
+    def present(self) -> list[int]:
+        """Return the layers that hold a pixel, ascending. Waits for the device once."""
+        return torch.bincount(torch.cat([layer.flatten() for layer in self.terms()])).nonzero()[:, 0].tolist()
+
 
 @dataclass(frozen=True)
 class LayeredScene:
@@ -132,8 +136,7 @@ class LayeredScene:
     @cached_property
     def sampled_layers(self) -> int:
         """Number of layers in a sample of the scene: every eighth row and column of :attr:`labels`."""
-        terms = [layer.flatten() for layer in self.labels.every(SAMPLE).terms()]
-        return int((torch.bincount(torch.cat(terms)) > 0).sum())
+        return len(self.labels.every(SAMPLE).present())
 
 
 def layered_scene(
