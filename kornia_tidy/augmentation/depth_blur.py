@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +30,7 @@ from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.misread_depth import misread_depth
 from kornia_tidy.optics.thin_lens import NEAREST_DEPTH, ThinLensCamera, check_lens
 from kornia_tidy.optics.units import check_depth_fits, check_image, warn_of_metres, warn_once
-from kornia_tidy.render.compositing import render
+from kornia_tidy.render.compositing import COMPOSITING as RENDERERS
 
 _SHARP = 0.5  # pixels: a disc of this radius, or a smaller one, is a point
 # Discs are computed where log(radius + _OFFSET) is evenly spaced, about so many for each factor of e. The larger two
@@ -150,8 +150,7 @@ def depth_blur(
         radius = radius.abs()  # near and far discs are alike: only occlusion needs their order
     layer = disc_layer(radius, max_radius)
     light = decode(image.to(dtype), color_space)
-    discs = _discs(layer, image.shape[1], max_radius)
-    blurred = render(light, layer, discs, compositing, border="replicate")
+    blurred = RENDERERS[compositing](light, layer, *_discs(layer, image.shape[1], max_radius), border="replicate")
     return encode(blurred, color_space).to(image.dtype)
 
 
@@ -230,16 +229,8 @@ def _discs_each_e(max_radius: float) -> float:
     return math.ceil(_DENSITY * logarithm) / logarithm if logarithm else 0.0
 
 
-class _Discs(NamedTuple):
-    """Discs as the renderer reads PSFs, (D, C, P, P), around the layers (D,)."""
-
-    psfs: Tensor
-    defocus: Tensor
-    veil: None = None
-
-
-def _discs(layer: Tensor, channels: int, max_radius: float) -> _Discs:
-    """Return the discs around the layers of a scene, as the renderer reads PSFs."""
+def _discs(layer: Tensor, channels: int, max_radius: float) -> tuple[Tensor, Tensor]:
+    """Return the layers around those of a scene, (D,), and their discs, (D, C, P, P)."""
     if Mode.GRAPH in torch_mode():  # which shows no values
         last = disc_layer(torch.tensor(max_radius, dtype=torch.float64), max_radius)
         ends = -last, last
@@ -252,7 +243,7 @@ def _discs(layer: Tensor, channels: int, max_radius: float) -> _Discs:
     made = disc.__wrapped__ if torch.compiler.is_compiling() else disc  # which warns of caches
     psfs = torch.stack([made(radius, side) for radius in radii]).to(layer)
     nodes = layer.new_tensor(list(numbers))
-    return _Discs(psfs[:, None].expand(-1, channels, -1, -1), nodes)
+    return nodes, psfs[:, None].expand(-1, channels, -1, -1)
 
 
 @lru_cache(maxsize=1024)
