@@ -26,6 +26,7 @@ LEAST_WINDOW = 41  # px; a smaller limit than that of the presets asks for small
 WIDEST_DISC = 257  # px; up to here the window holds the lens's disc
 USUAL_WINDOW = 65  # px; small pictures have smaller ones, which says nothing of the lens
 MOST_LAYERS = 4096
+MOST_DEFOCUS = 2e4  # rad of a node that is asked for: half a second, which grows with the square
 
 
 def check_defocus_range(

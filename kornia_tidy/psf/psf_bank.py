@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_number, check_values, described
+from kornia_tidy.checks import check_choice, check_finite, check_number, described
 from kornia_tidy.files import error_prefix, write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
@@ -40,6 +40,32 @@ class BankOfPSFs:
             name, value = part.name, getattr(self, part.name)
             if value is not None and tuple(value.shape) != (own := wanted.get(name, shape[:-2])):
                 raise ValueError(f"{name} must have shape {own} as psfs have, got {tuple(value.shape)}")
+
+    def check(self) -> None:
+        """Raise an error unless the values are light: real, finite, some of it, at nodes of defocus that ascend.
+
+        PSFs of one place may not be negative either. Between measured places a thin plate may undershoot.
+
+        Raises:
+            TypeError: if a tensor is complex or holds integers.
+            ValueError: if a value is NaN or infinite, no PSF holds light, one is negative, or nodes do not ascend.
+
+        Example:
+            >>> PSFBank(-torch.ones(1, 1, 1, 1), torch.zeros(1), torch.ones(1, 1)).check()
+            Traceback (most recent call last):
+            ValueError: psfs must not be negative, got -1.0
+        """
+        for name, value in self.present().items():
+            if not value.is_floating_point():
+                raise TypeError(f"{name} must be real floating-point numbers, got {value.dtype}")
+            check_finite(name, value)
+        if not bool((self.defocus.diff() > 0).all()):
+            raise ValueError(f"defocus must ascend, got {self.defocus.tolist()!r:.200}")
+        lowest, highest = (float(end) for end in torch.aminmax(self.psfs.detach()))
+        if lowest < 0 and len(self.axes) == 2:
+            raise ValueError(f"psfs must not be negative, got {lowest}")
+        if not highest > 0:
+            raise ValueError("psfs must hold some light, got none that is above 0")
 
     def present(self) -> dict[str, Tensor]:
         """Return the tensors by their names."""
@@ -197,13 +223,9 @@ class BankOfPSFs:
         names = {part.name for part in fields(cls)}
         if found != cls.form or not names - {"veil"} <= set(tensors) <= names:
             raise ValueError(f"{path} is not a {cls.words}: its format is {found!r:.40} with {sorted(tensors)!r:.200}")
-        for name, value in tensors.items():
-            check_finite(f"{name} of {path}", value)
-        with error_prefix(f"cannot read {path}"):
+        with error_prefix(f"cannot read {path}", TypeError):
             bank = cls(**tensors)
-            _check_ascending(bank.defocus)
-            if "field" not in names:  # between places that were measured, a thin plate may undershoot
-                _check_light("psfs", bank.psfs)
+            bank.check()
         return bank
 
 
@@ -218,7 +240,7 @@ class PSFBank(BankOfPSFs):
         veil: (D, C) share of the light that is spread evenly over the image, or None.
 
     Raises:
-        ValueError: if the shapes do not fit each other or the nodes do not ascend.
+        ValueError: if the shapes do not fit each other. Values are checked by :meth:`check`, on use and in files.
 
     Example:
         >>> bank = PSFBank(torch.ones(2, 3, 1, 1), torch.tensor([-1.0, 1.0]), torch.ones(2, 3))
@@ -243,10 +265,8 @@ class PSFBank(BankOfPSFs):
         Raises:
             ValueError: if a value is negative or not finite, a PSF holds no light, or the nodes do not ascend.
         """
-        check_finite("defocus of measured psfs", defocus)
-        _check_light("measured psfs", psfs)
-        _check_ascending(defocus)
         total = psfs.sum((-2, -1))
+        cls(psfs, defocus, total).check()
         if not bool((total > 0).all()):
             raise ValueError("every measured psf must hold some light, got one that is all zero")
         return cls(psfs / total[..., None, None], defocus, torch.ones_like(total))
@@ -269,19 +289,6 @@ def checked_nodes(defocus: Sequence[float]) -> tuple[float, ...]:
     if not nodes or not all(math.isfinite(psi) for psi in nodes):
         raise ValueError(f"defocus must be one or more nodes in finite radians, got {nodes!r:.80}")
     return tuple(float(psi) for psi in nodes)
-
-
-def _check_ascending(defocus: Tensor) -> None:
-    """Raise ``ValueError`` unless nodes of defocus ascend."""
-    if not bool((defocus.diff() > 0).all()):
-        raise ValueError(f"defocus must ascend, got {defocus.tolist()!r:.200}")
-
-
-def _check_light(name: str, psfs: Tensor) -> None:
-    """Raise ``ValueError`` unless PSFs are light: finite and not negative."""
-    check_values(name, psfs)
-    if not bool((torch.isfinite(psfs) & (psfs >= 0)).all()):
-        raise ValueError(f"{name} must be finite and not negative, got a minimum of {float(psfs.min())}")
 
 
 def enclosing_window(psfs: Tensor, share: float) -> int | None:

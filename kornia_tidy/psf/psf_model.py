@@ -45,7 +45,14 @@ from kornia_tidy.psf.field_bank import (
 from kornia_tidy.psf.field_nodes import field_nodes
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.learnable_aperture import LearnableAperture, check_open
-from kornia_tidy.psf.lens_limits import LEAST_WINDOW, PARTS, WIDEST_DISC, check_defocus_range, fitting_lens
+from kornia_tidy.psf.lens_limits import (
+    LEAST_WINDOW,
+    MOST_DEFOCUS,
+    PARTS,
+    WIDEST_DISC,
+    check_defocus_range,
+    fitting_lens,
+)
 from kornia_tidy.psf.measured_field import measured_nodes
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
 from kornia_tidy.psf.psf_bank import PSFBank, checked_nodes
@@ -236,11 +243,13 @@ class PSFModel:
         Raises:
             TypeError: if nodes or field are not numbers.
             ValueError: if nodes or points of the field are not one or more finite ones, field points are given without
-                a lens, or the data type is another one.
+                a lens, the data type is another one, or a node is beyond 2e4 rad.
         """
         if dtype is not None:
             check_choice("dtype", dtype, (torch.float32, torch.float64))
         defocus = defocus if defocus is None else checked_nodes(defocus)
+        if defocus is not None and self.measured is None and max(map(abs, defocus)) > MOST_DEFOCUS:
+            raise ValueError(f"defocus must be within {MOST_DEFOCUS:g} rad to be computed, got {max(defocus, key=abs)}")
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = dtype or (torch.float64 if self.fidelity.double else torch.float32)
         if field is not None and isinstance(self.measured, FieldBank):
@@ -659,6 +668,7 @@ class PSFModel:
             >>> model.window, torch.equal(model.psf_bank().psfs, measured.psfs)
             (5, True)
         """
+        bank.check()
         cut = bool((bank.psfs == 0).any())
         mean = self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))
         return mean._replace(measured=bank, measured_cut=cut)

@@ -97,14 +97,20 @@ class TestPSFBank(BaseTester):
     @pytest.mark.parametrize(
         ("psfs", "defocus", "message"),
         [
-            (-torch.ones(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must be finite and not negative, got a minimum"),
+            (-torch.ones(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must not be negative, got -1.0"),
+            (torch.zeros(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must hold some light"),
+            (torch.ones(2, 3, 5, 5).long(), torch.tensor([0.0, 1.0]), "psfs must be real .* got torch.int64"),
+            (torch.ones(2, 3, 5, 5) * torch.nan, torch.tensor([0.0, 1.0]), "psfs must be finite, got nan"),
             (torch.ones(2, 3, 5, 5), torch.tensor([1.0, 0.0]), r"defocus must ascend, got \[1.0, 0.0\]"),
         ],
     )
-    def test_exception_files_of_no_light(self, psfs, defocus, message, tmp_path):
-        PSFBank(psfs, defocus, torch.ones(2, 3)).save(tmp_path / "bank.safetensors")
-        with pytest.raises(ValueError, match="cannot read .*" + message):
+    def test_exception_files_and_banks_of_no_light(self, psfs, defocus, message, tmp_path):
+        made = PSFBank(psfs, defocus, torch.ones(2, 3))
+        made.save(tmp_path / "bank.safetensors")
+        with pytest.raises((TypeError, ValueError), match="cannot read .*" + message):
             PSFBank.load(tmp_path / "bank.safetensors")
+        with pytest.raises((TypeError, ValueError), match=message):
+            PSFModel().with_bank(made)
 
     @pytest.mark.parametrize(
         ("defocus", "error", "message"),
@@ -119,6 +125,10 @@ class TestPSFBank(BaseTester):
         for psfs_at in (bank.at_defocus, lambda nodes: TiDyOptics().psf_bank(defocus=nodes)):
             with pytest.raises(error, match=message):
                 psfs_at(defocus)
+
+    def test_exception_nodes_far_out_of_focus(self):
+        with pytest.raises(ValueError, match=r"defocus must be within 20000 rad to be computed, got 1000000"):
+            TiDyOptics().psf_bank(defocus=[1e6])
 
     def test_feature_nodes_of_a_tensor_are_those_of_a_list(self):
         model = PSFModel(fidelity="draft")
@@ -149,9 +159,9 @@ class TestPSFBank(BaseTester):
     @pytest.mark.parametrize(
         ("psfs", "defocus", "message"),
         [
-            (-torch.ones(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "not negative"),
+            (-torch.ones(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "not be negative"),
             (torch.full((2, 1, 3, 3), torch.nan), torch.tensor([0.0, 1.0]), "finite"),
-            (torch.zeros(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "all zero"),
+            (torch.zeros(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "must hold some light"),
             (torch.ones(2, 1, 3, 3), torch.tensor([1.0, 0.0]), "ascend"),
         ],
     )
