@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from kornia_tidy.reconstruction.clipped_light import CLIPPED
+
 BEYOND = 6.0  # standard deviations of the noise beyond all neighbours
 CONTRAST = 0.5  # of the range of the neighbours, beyond them: no lens draws a point so much sharper than its surround
 ROWS = 256  # that are worked on together
@@ -16,12 +18,18 @@ BLOCK = 8  # px of a square in which noise is measured, and of JPEG's blocks
 DARKEST_SQUARES = 0.05  # share of the squares of a light level: those of least variance show only noise
 LEVELS = 16  # of light, at which noise is measured
 FEWEST = 64  # squares of a level
+HALF_NORMAL = 0.6745  # of a standard deviation: median of absolute values
 LEAST_OF_EVEN = 0.499  # of the variance: median of the least twentieth of squares, counted on 62,500 of white noise
 LARGEST = 2048  # px, side of the middle of a picture in which noise is measured
 JPEG = 1.1  # least factor of blocks: 1.00 to 1.03 without compression, 1.27 and more at a quality of 92
 JPEG_NOISE = 0.008  # of even noise: of .006, .008 and .01 the best for a quality of 92, four scenes of half A
 FALLING = -0.2  # of the variance in the dark for full light: noise of light rises with it, in encoded pictures it falls
 TWICE = 2.0  # a stated noise is doubted beyond this factor
+SAMPLED = 512  # px of a row, whose median is its level
+BANDS = 3.0  # a factor by which steps between rows exceed those between columns, or the reverse
+FAINT_BAND = 0.15  # of the noise: weaker bands stay
+WHITE = 2.8  # least ratio of fourth to second differences: 3.4 for bands, and 1.4 for waves of five rows
+LAW = 0.25  # standard deviation of the logarithm of variances over a sensor's law; .05 to .21 where it holds
 
 
 class Repaired(NamedTuple):
@@ -81,6 +89,71 @@ def _repaired(part: Tensor, noise: MeasuredNoise) -> tuple[Tensor, tuple[Tensor,
     return torch.stack([other[place] for other in around]).median(0).values, place
 
 
+class WithoutBands(NamedTuple):
+    """A capture whose rows and columns have the same level as their neighbours."""
+
+    light: Tensor
+    """(C, H, W)."""
+    size: float
+    """Standard deviation of the levels of a sensor's bands; 0 for none."""
+    rows: bool = True
+    """Whether they are rows. False: columns."""
+
+
+def repair_bands(light: Tensor, noise: float) -> WithoutBands:
+    r"""Subtract the level by which each row, or each column, differs from its neighbours, where a sensor has bands.
+
+    In the median along a row the second difference across rows shows its level, and little of a blurred scene: no more
+    than that of the columns, unless the sensor adds bands. Those of stripes in a scene change less from row to row,
+    since optics blur them, and stay. The levels l of second differences m are those of least
+    :math:`|D^2 l - m|^2 / v + |l|^2 / b^2`, v the variance that the scene leaves, :math:`b^2` that of bands.
+
+    Args:
+        light: (C, H, W) linear light.
+        noise: standard deviation of its noise.
+
+    Example:
+        >>> light = 0.5 + 0.01 * torch.randn(3, 64, 64, generator=torch.Generator().manual_seed(0))
+        >>> light[:, ::2] += 0.02
+        >>> repaired = repair_bands(light, 0.01)
+        >>> round(repaired.size, 2), bool((repaired.light[:, ::2].mean() - repaired.light[:, 1::2].mean()).abs() < 1e-3)
+        (0.02, True)
+    """
+    if min(light.shape[-2:]) < BLOCK + 2:
+        return WithoutBands(light, 0.0)
+    steps = [_steps(part) for part in (light, light.transpose(1, 2))]
+    spreads = [_spread(step) for step in steps]
+    size = math.sqrt(abs(spreads[0] ** 2 - spreads[1] ** 2) / 6)
+    rows = spreads[0] > spreads[1]
+    along = steps[0 if rows else 1]
+    faint = max(spreads) <= BANDS * min(spreads) or size <= FAINT_BAND * noise
+    if faint or _spread(along.diff(n=2)) < WHITE * max(spreads):
+        return WithoutBands(light, 0.0)
+    levels = _levels(along, max(min(spreads) ** 2 / size**2, 1e-3))
+    known = light < CLIPPED
+    return WithoutBands(torch.where(known, light - (levels[:, None] if rows else levels), light), size, rows)
+
+
+def _steps(light: Tensor) -> Tensor:
+    """Return the median of second differences across rows along each, (H,); borders are repeated."""
+    some = light[..., :: max(1, light.shape[-1] // SAMPLED)]
+    padded = torch.cat([some[:, :1], some, some[:, -1:]], 1)
+    return padded.diff(n=2, dim=1).transpose(0, 1).flatten(1).nanmedian(1).values
+
+
+def _spread(values: Tensor) -> float:
+    """Return the standard deviation of normal values, by the median of their sizes."""
+    return float(values.abs().median()) / HALF_NORMAL
+
+
+def _levels(steps: Tensor, doubt: float) -> Tensor:
+    """Return levels of least squares from their second differences, with mirrored borders."""
+    mirrored = torch.cat([steps, steps.flip(0)]).double()
+    response = 2 * (2 * math.pi * torch.fft.rfftfreq(len(mirrored), device=steps.device)).cos() - 2
+    spectrum = torch.fft.rfft(mirrored) * response / (response.square() + doubt)
+    return torch.fft.irfft(spectrum, n=len(mirrored))[: len(steps)].to(steps)
+
+
 class MeasuredNoise(NamedTuple):
     """The noise of a capture: its variance is ``dark + rise * light``."""
 
@@ -112,6 +185,20 @@ def measure_noise(light: Tensor) -> MeasuredNoise | None:
         >>> round(measure_noise(drawn).std(0.5), 3)
         0.01
     """
+    found = _variances(light)
+    if found is None:
+        return None
+    level, variance = found
+    weight = 1 / variance.clamp(min=1e-12).square()
+    rise = _slope(level, variance, weight)
+    dark_variance = float(((variance - rise * level) * weight).sum() / weight.sum())
+    if dark_variance < 0:
+        rise, dark_variance = float((variance * level * weight).sum() / (level.square() * weight).sum()), 0.0
+    return MeasuredNoise(dark_variance, rise)
+
+
+def _variances(light: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return levels of light, ascending, and the variance of noise at each."""
     if min(light.shape[-2:]) < BLOCK + 2:
         return None
     mask = light.new_tensor([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])[None, None]
@@ -131,13 +218,17 @@ def measure_noise(light: Tensor) -> MeasuredNoise | None:
         least = squares[group].sort().values[: max(4, round(DARKEST_SQUARES * len(group)))]
         levels.append(means[group].mean())
         variances.append(least.median() / LEAST_OF_EVEN)
-    level, variance = torch.stack(levels).double(), torch.stack(variances).double()
-    weight = 1 / variance.clamp(min=1e-12).square()
-    rise = _slope(level, variance, weight)
-    dark_variance = float(((variance - rise * level) * weight).sum() / weight.sum())
-    if dark_variance < 0:
-        rise, dark_variance = float((variance * level * weight).sum() / (level.square() * weight).sum()), 0.0
-    return MeasuredNoise(dark_variance, rise)
+    return torch.stack(levels).double(), torch.stack(variances).double()
+
+
+def _off_the_law(light: Tensor, law: MeasuredNoise) -> float:
+    """Return the standard deviation of the logarithm of variances over those of a sensor's law."""
+    found = _variances(light)
+    if found is None or len(found[0]) < LEVELS:
+        return 0.0
+    level, variance = found
+    expected = (law.dark + law.rise * level).clamp(min=1e-12)
+    return float((variance.clamp(min=1e-12) / expected).log().std())
 
 
 def blockiness(light: Tensor) -> float:
@@ -208,11 +299,18 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     if noise is None:
         return CheckedCapture(light, None, ())
     notes = []
+    level = float(middle.mean())
+    found = noise.std(level)
     repaired = repair_outliers(light, noise)
     if repaired.count:
         notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced by their neighbours' median")
-    level = float(middle.mean())
-    found = noise.std(level)
+    even = repair_bands(repaired.light, found)
+    if even.size:
+        bands = "rows" if even.rows else "columns"
+        notes.append(
+            f"its {bands} differed by {even.size:.2g} of full scale, and were levelled: subtract a dark capture"
+        )
+    middle = even.light[:, top : top + LARGEST, left : left + LARGEST]
     if told is not None and found > TWICE * told.std(level):
         factor = found / max(told.std(level), 1e-9)
         notes.append(
@@ -223,7 +321,12 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
         notes.append(f"it shows the blocks of JPEG, taken for a noise of {JPEG_NOISE}: rather restore the raw file")
     elif noise.rise < FALLING * noise.dark:
         notes.append(
-            "its noise falls with light, as in pictures that are encoded or tone-mapped: give it as sRGB, or develop "
-            "the raw file to linear light"
+            "its noise falls with light, as in pictures that are encoded or tone-mapped: give it as sRGB (without "
+            "--linear, or linear=False), or develop the raw file to linear light (kornia-tidy raw develop)"
         )
-    return CheckedCapture(repaired.light, noise, tuple(notes), JPEG_NOISE if blocks else 0.0)
+    elif _off_the_law(middle, told or noise) > LAW:
+        notes.append(
+            "its noise does not grow with light as a sensor's does, as behind a tone curve or a sensor of uneven "
+            "pixels: develop the raw file to linear light (kornia-tidy raw develop), or divide by a flat field"
+        )
+    return CheckedCapture(even.light, noise, tuple(notes), JPEG_NOISE if blocks else 0.0)

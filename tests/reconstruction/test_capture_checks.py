@@ -18,6 +18,7 @@ from kornia_tidy.reconstruction.capture_checks import (
     blockiness,
     check_capture,
     measure_noise,
+    repair_bands,
     repair_outliers,
 )
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
@@ -70,6 +71,41 @@ class TestRepairOutliers(BaseTester):
         repaired = repair_outliers(light, MeasuredNoise(1e-6, 0.0))
         assert repaired.count == 2
         assert (repaired.light == 0.2).all()
+
+
+class TestRepairBands(BaseTester):
+    @pytest.mark.parametrize("rows", [True, False])
+    @pytest.mark.parametrize("size", [0.002, 0.008])
+    def test_feature_bands_are_levelled(self, size, rows):
+        light, sensor = capture()
+        bands = size * torch.randn(light.shape[-1], generator=torch.Generator().manual_seed(2))
+        marked = light + (bands[:, None] if rows else bands)
+        found = repair_bands(marked, told(sensor).std(float(light.mean())))
+        assert found.size == pytest.approx(size, rel=0.2)
+        assert (found.light - light).square().mean() < 0.4 * bands.square().mean()
+
+    def test_feature_an_undisturbed_capture_stays(self):
+        for electrons in (300.0, 100_000.0):
+            light, sensor = capture(electrons)
+            assert repair_bands(light, told(sensor).std(float(light.mean()))).light is light
+
+    def test_feature_clipped_pixels_stay(self):
+        light, sensor = capture()
+        marked = (light + 0.01 * torch.randn(light.shape[-1], generator=torch.Generator().manual_seed(2))).clamp(0, 1)
+        marked[:, :40, :40] = 1.0
+        found = repair_bands(marked, told(sensor).std(float(light.mean())))
+        assert found.size > 0
+        assert (found.light[:, :40, :40] == 1).all()
+
+    def test_feature_stripes_of_a_scene_stay(self):
+        """Optics blur them: from row to row they change little."""
+        light = 0.3 + 0.002 * torch.randn(3, 200, 200, generator=torch.Generator().manual_seed(0))
+        for period in (5, 8, 20):
+            stripes = 0.02 * (2 * np.pi / period * torch.arange(200.0)).sin()
+            assert repair_bands(light + stripes[:, None], 0.002).size == 0
+
+    def test_feature_too_small(self):
+        assert repair_bands(torch.rand(3, 9, 200), 0.01).size == 0
 
 
 def jpeg(light, quality):
@@ -127,6 +163,33 @@ class TestCheckCapture(BaseTester):
         light, sensor = capture()
         notes = check_capture(linear_rgb_to_rgb(light[None])[0], told(sensor)).notes
         assert any("its noise falls with light" in note for note in notes)
+
+    def test_feature_dead_pixels_are_no_blocks(self):
+        light, sensor = capture(50_000.0, side=200)
+        smooth = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(light[None], (4,) * 4, "replicate"), 9, 1)
+        seen = sensor(smooth, generator=torch.Generator().manual_seed(0))[0]
+        dead = torch.rand(light.shape, generator=torch.Generator().manual_seed(4)) < 3e-3
+        marked = torch.where(dead, 0.0, seen)
+        assert blockiness(marked) > JPEG
+        checked = check_capture(marked, told(sensor))
+        assert checked.least_noise == 0
+        assert all("outliers" in note for note in checked.notes)
+
+    def test_feature_bands_are_told(self):
+        light, sensor = capture()
+        bands = 0.004 * torch.randn(light.shape[-2], 1, generator=torch.Generator().manual_seed(2))
+        (note,) = (note for note in check_capture(light + bands, told(sensor)).notes if "outliers" not in note)
+        assert note.startswith("its rows differed by 0.00")
+        (note,) = (note for note in check_capture(light + bands.T, told(sensor)).notes if "outliers" not in note)
+        assert note.startswith("its columns differed by 0.00")
+
+    def test_feature_a_tone_curve_is_told(self):
+        light, sensor = capture()
+        encoded = linear_rgb_to_rgb(light[None])
+        toned = rgb_to_linear_rgb(encoded.square() * (3 - 2 * encoded))[0]
+        for stated in (told(sensor), None):
+            assert any("as behind a tone curve" in note for note in check_capture(toned, stated).notes)
+            assert not any("as behind a tone curve" in note for note in check_capture(light, stated).notes)
 
     def test_feature_reconstruction_repairs_and_tells(self):
         optics = TiDyOptics(fidelity="draft", sensor=SensorNoise(2.4 / 20_000, full_well=20_000.0))

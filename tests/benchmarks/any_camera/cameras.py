@@ -47,11 +47,15 @@ POOLS = {
     "slow": Pool(12, (25.0, 50.0), (2.5e-6, 9e-6), FAMILIES),
     "sweeps": Pool(10, (5.0, 30.0), (2.5e-6, 9e-6), ("focal sweep", "like fishers")),
     "corner": Pool(8, (14.0, 22.0), (4e-6, 8e-6), FAMILIES),  # in the field of a single element
+    "edge": Pool(8, (14.0, 22.0), (4e-6, 9e-6), ("focal sweep", "focal sweep", "spiral", "flat")),  # further out there
+    "kinoforms": Pool(8, (4.0, 30.0), (2e-6, 10e-6), ("kinoform",)),
+    "wide": Pool(12, (4.0, 60.0), (2e-6, 10e-6), FAMILIES),
     "validation": Pool(8, (4.5, 55.0), (2.2e-6, 9.5e-6), FAMILIES, hard=3),
     "test": Pool(12, (4.0, 60.0), (2e-6, 10e-6), (*FAMILIES, "cubic", "fresnel"), hard=5),
 }
 
-BESIDE_TRAINING = ("sharp", "lenses", "slow", "sweeps", "corner")
+BESIDE_TRAINING = ("sharp", "lenses", "slow", "sweeps", "corner", "edge", "kinoforms", "wide")
+BEHIND_AN_ELEMENT = {"corner": (0.4, 0.9), "edge": (0.75, 1.0)}  # places, in halves of its field
 
 
 def pool_names(pool: str) -> list[str]:
@@ -73,7 +77,8 @@ def camera(name: str) -> TiDyOptics:
         optics = own_system(name).optics
     else:
         pool, _, index = name.rpartition("-")
-        optics = (_behind_an_element if pool == "corner" else _drawn)(POOLS[pool], name, int(index))
+        draw = _behind_an_element if pool in BEHIND_AN_ELEMENT else _drawn
+        optics = draw(POOLS[pool], name, int(index))
     optics.sensor = None
     return optics.eval().requires_grad_(requires_grad=False)
 
@@ -100,7 +105,10 @@ def _behind_an_element(pool: Pool, name: str, index: int) -> TiDyOptics:
     f_number, pitch, focus = draw.uniform(pool.f_numbers), draw.uniform(pool.pitches), draw.uniform((0.5, 2.0))
     lens = Lens.named(ELEMENT, f_number, focus)
     shape = _masks(family, masks, draw.uniform(STRENGTH), draw.generator)
-    height, angle = lens.field / pitch * draw.uniform((0.4, 0.9)), math.tau * draw.whole(360) / 360
+    height, angle = (
+        lens.field / pitch * draw.uniform(BEHIND_AN_ELEMENT[name.partition("-")[0]]),
+        math.tau * draw.whole(360) / 360,
+    )
     place = height * math.sin(angle), height * math.cos(angle)
     fidelity = Fidelity.preset("balanced").replace(window=WINDOW, stray_light="veil")
     return TiDyOptics(shape, lens.camera(pitch), lens=lens, fidelity=fidelity, field_center=place)
@@ -153,6 +161,10 @@ def _masks(family: str, count: int, strength: float, random: torch.Generator) ->
         return PixelwiseMask(initial=initial_heights(family, random)[:count])
     if family == "spiral":
         return SpiralMask(count, 46, generator=random)
+    if family == "kinoform":  # heights of several waves, less whole ones
+        whole = ZernikeMask(count, 23, generator=random)
+        wave = REFERENCE_WAVELENGTH / (whole.material.index(REFERENCE_WAVELENGTH) - 1)
+        return PixelwiseMask(initial=(4 * strength * whole.heights().detach()).remainder(wave))
     kinds = {"pixelwise": PixelwiseMask, "fourier": FourierMask, "zernike": ZernikeMask, "radial": RadialMask}
     masks = kinds[family](count, 23, generator=random)
     with torch.no_grad():

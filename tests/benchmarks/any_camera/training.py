@@ -22,7 +22,7 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.masks import MASK_SPAN, NoMask, PixelwiseMask
 from kornia_tidy.optics import REFERENCE_WAVELENGTH
 from kornia_tidy.reconstruction import RuledClosedForm
-from kornia_tidy.reconstruction.any_camera import any_camera_head, corrected, largest_share
+from kornia_tidy.reconstruction.any_camera import any_camera_head, beside_clipped, corrected, largest_share
 from kornia_tidy.reconstruction.capture_checks import JPEG_NOISE
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
@@ -47,12 +47,13 @@ TAUGHT_SHARE = 0.35
 SAVED_EVERY = 100  # steps
 
 
-OVEREXPOSED = 0.15  # share of draws with up to four times the exposure at which white is full scale
+OVEREXPOSED = 0.2  # share of draws with up to four times the exposure at which white is full scale
+DARK, DARKEST = 0.3, 0.1  # share of the other draws with less light, and the least share of it
 MISTAKEN, MISTAKES = 0.25, 1  # share of draws with PSFs of a camera that is a little different; kinds of each camera
 LENGTHS, SHIFT, FOCUS = 0.03, 0.02, 1.0  # errors: of lengths; of the mask, in radii of the pupil; of focus, in radians
 DEMOSAICED = 0.1  # share of draws behind a Bayer filter
-GRAINY = 0.2  # share of draws whose scene has grain, which the optics blur and a network should keep
-COMPRESSED, QUALITIES = 0.1, (85, 98)  # share of draws as JPEG; quality
+GRAINY = 0.2, 0.5  # share of draws, and of dark ones, whose scene has grain, which a network should keep
+COMPRESSED, QUALITIES = 0.12, (85, 98)  # share of draws as JPEG; quality
 LOSS_OF_HARM = 3.0  # of a picture that is worse than the closed form's, beside its loss: for each decibel behind
 KINDS = {"-photographs": 0.4, "-more": 0.4, "-collages": 0.1, "": 0.1}  # share of draws of captures, where there are
 PULL = 1e-4  # of the weights towards the first ones, for each step at the full rate
@@ -166,19 +167,22 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
 
     They follow from the step alone.
     """
-    random = torch.Generator().manual_seed(keyed_seed("any-camera sixth", step))
-    torch.manual_seed(keyed_seed("any-camera sixth gains", step))
+    random = torch.Generator().manual_seed(keyed_seed("any-camera seventh", step))
+    torch.manual_seed(keyed_seed("any-camera seventh gains", step))
     parts = []
     for _ in range(CAMERAS_A_STEP):
         taught = float(torch.rand((), generator=random)) < TAUGHT_SHARE
         names = [name for name in cameras.names if (name in TEACHERS) == taught]
         name = names[int(torch.randint(len(names), (), generator=random))]
         light, image = cameras.crops(name, CROPS_A_CAMERA, random)
-        chance = torch.rand(7, generator=random, dtype=torch.float64).tolist()
+        chance = torch.rand(8, generator=random, dtype=torch.float64).tolist()
         gain = random_gain(torch.maximum(light.amax((0, 2, 3)), image.amax((0, 2, 3))))
         if chance[0] < OVEREXPOSED:
             gain = gain * 4 ** (chance[0] / OVEREXPOSED)
-        if chance[4] < GRAINY:
+        elif chance[7] < DARK:
+            gain = gain * DARKEST ** (chance[7] / DARK)
+            light, image, gain = light * gain, image * gain, torch.ones_like(gain)  # grain of dark scenes is strong
+        if chance[4] < GRAINY[chance[0] >= OVEREXPOSED and chance[7] < DARK]:
             light, image = with_grain(light, image, cameras.form(name), random)
         sensor = drawn_sensor(random)
         noisy = sensor(light * gain, generator=random)
@@ -193,7 +197,7 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
         capture = linear_rgb_to_rgb(noisy)
         found = form.settings_of(capture, told)
         restored = form.restore_by(capture, found)
-        largest = largest_share(form, found).expand(-1, 1, *capture.shape[-2:])
+        largest = beside_clipped(largest_share(form, found), capture)
         truth = linear_rgb_to_rgb((image * gain).clamp(0, 1))
         known = (noisy < CLIPPED).all(1, keepdim=True)
         disturbed = chance[0] < OVEREXPOSED or chance[2] < DEMOSAICED or chance[5] < COMPRESSED or chance[3] < MISTAKEN
