@@ -111,11 +111,11 @@ class _LayOver(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         light, alpha, cumulative, scale, passed, shares = ctx.saved_tensors
-        seen = light * scale
-        behind = torch.zeros_like(seen)
+        seen, of_alphas = light * scale, light.new_zeros(*light.shape[:2], 2, *light.shape[2:])
+        behind, of_scale = of_alphas.unbind(2)
         for layer in range(seen.shape[1] - 1):
             torch.addcmul(seen[:, layer], passed[:, layer], behind[:, layer], out=behind[:, layer + 1])
+        torch.addcmul(light, alpha, behind, value=-1, out=of_scale).mul_(scale).mul_(cumulative >= 0)
         of_light = shares * gradient[:, None]
-        of_scale = torch.addcmul(light, alpha, behind, value=-1).mul_(scale).mul_(cumulative >= 0)
-        of_alphas = torch.stack([behind, of_scale], 2).mul_(of_light.neg()[:, :, None])
+        of_alphas.mul_(of_light.neg()[:, :, None])
         return *(pad(own, (ctx.lost, 0, ctx.lost, 0)) for own in (of_light, of_alphas)), None
