@@ -10,6 +10,7 @@ import math
 import operator
 import sys
 from collections.abc import Collection
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # settings check their values too, and a command's help does not wait for torch
@@ -42,6 +43,13 @@ def check_number(name: str, value: Any, unit: str = "") -> None:
     """Raise ``TypeError`` unless ``value`` is a single number."""
     if isinstance(value, str) or not hasattr(value, "__float__") or math.prod(getattr(value, "shape", ())) != 1:
         raise TypeError(f"{name} must be a number{' in ' + unit if unit else ''}, got {described(value)}")
+
+
+def check_count(name: str, value: int, least: int = 1, most: int | None = None) -> None:
+    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least`` and at most ``most``."""
+    if not isinstance(value, Integral) or value < least or (most is not None and value > most):
+        allowed = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name} must be a whole number {allowed}, got {value!r}")
 
 
 def check_metres(name: str, value: float, shortest: float, longest: float, example: str) -> None:

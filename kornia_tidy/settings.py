@@ -47,7 +47,7 @@ class Unit:
 
     def complaint(self, value: Any, kind: type) -> str:
         """Return the fault of a number as the end of a sentence; an empty text if it is allowed."""
-        if _is_number(value, kind) and (self.infinite or -inf < value < inf) and self._holds(value):
+        if is_number(value, kind) and (self.infinite or -inf < value < inf) and self._holds(value):
             return ""
         return f"must be {self._allowed(kind)}, got {value!r:.80}"
 
@@ -252,7 +252,7 @@ def _complaint(setting: Setting, value: Any) -> str:
     return f"must be {words}, got {value!r:.80}" if words and not isinstance(value, kind) else ""
 
 
-def _is_number(value: Any, kind: type) -> bool:
+def is_number(value: Any, kind: type = float) -> bool:
     """Whether a value is a number that a float can hold; integers in JSON may be larger."""
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         return False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from numbers import Integral
 from typing import ClassVar
 
 import cv2
@@ -14,6 +13,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from torch import Tensor
 
+from kornia_tidy.checks import check_count
 from kornia_tidy.data.leaf_textures import Leaves, paint_leaves
 from kornia_tidy.data.picture_header import check_pixels
 from kornia_tidy.data.rgbd import Scene
@@ -125,8 +125,7 @@ class PaintedScenes(SceneDataset):
         transform: Transform | None = None,
     ) -> None:
         super().__init__(transform)
-        if not isinstance(length, Integral) or length < 1:
-            raise ValueError(f"length must be a positive integer, got {length!r}")
+        check_count("length", length)
         check_arguments(height, width, depth_range, 1, seed)
         self.length, self.height, self.width = length, height, width
         self.depth_range, self.seed = depth_range, seed
@@ -196,14 +195,12 @@ class DeadLeaves(PaintedScenes):
 def check_arguments(height: int, width: int, depth_range: tuple[float, float], num_leaves: int, seed: int) -> None:
     """Raise ``ValueError`` for arguments of :func:`dead_leaves` that are not allowed."""
     for name, value in (("height", height), ("width", width), ("num_leaves", num_leaves)):
-        if not isinstance(value, Integral) or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value!r}")
+        check_count(name, value)
     check_pixels("the scene", height, width)
     near, far = depth_range
     if not (0 < near < far and math.isfinite(near)):
         raise ValueError(f"depth_range must be (near, far) in metres with 0 < near < far, got {depth_range}")
-    if not isinstance(seed, Integral) or seed < 0:
-        raise ValueError(f"seed must be an integer of 0 or more, got {seed!r}")
+    check_count("seed", seed, least=0)
 
 
 def scatter_leaves(

@@ -14,6 +14,7 @@ from kornia_tidy.data.patches import central_crop
 from kornia_tidy.data.rgbd import Scene, check_pairing_options, read_rgbd
 from kornia_tidy.data.scene_dataset import SceneDataset, Transform
 from kornia_tidy.files import check_folder, find_files, read_json
+from kornia_tidy.settings import is_number
 
 ABOUT = "rgbd.json"
 KNOWN = ("image", "depth", "scale", "kind", "invalid", "focal_px", "baseline_m", "doffs_px")
@@ -144,8 +145,8 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
     if not isinstance(about, dict) or not {"image", "depth"} <= set(about) <= set(KNOWN):
         raise ValueError(f'cannot read {path}: it should hold "image" and "depth" and may hold {", ".join(KNOWN[2:])}')
     for name, value in about.items():
-        if not _fits(name, value):
-            raise ValueError(f"cannot read {path}: {name} must be {_kind(name)}, got {value!r:.80}")
+        if kind := _other_kind(name, value):
+            raise ValueError(f"cannot read {path}: {name} must be {kind}, got {value!r:.80}")
     return RGBDFolder(root, transform=transform, **about)
 
 
@@ -164,22 +165,14 @@ def scenes_in(root: str | os.PathLike[str], largest: int = 512) -> list[Scene]:
     return scenes
 
 
-def _kind(name: str) -> str:
-    return "a text" if name in _TEXTS else "a list of numbers" if name == "invalid" else "a number"
-
-
-def _fits(name: str, value: Any) -> bool:
-    """Return whether a value of the description has the type of its option."""
-    if _kind(name) == "a text":
-        return isinstance(value, str)
+def _other_kind(name: str, value: Any) -> str:
+    """Return the kind of an option's values if that of the description is of another one; else an empty text."""
+    if name in _TEXTS:
+        return "" if isinstance(value, str) else "a text"
     if name == "invalid":
-        return isinstance(value, list) and all(_is_number(entry) for entry in value)
-    return _is_number(value) or (value is None and name in {"focal_px", "baseline_m"})
-
-
-def _is_number(value: Any) -> bool:
-    """Return whether a value is a number that a float can hold; integers in JSON may be larger."""
-    return isinstance(value, float) or (type(value) is int and abs(value) < 1 << 1000)
+        numbers = isinstance(value, list) and all(is_number(entry) for entry in value)
+        return "" if numbers else "a list of numbers"
+    return "" if is_number(value) or (value is None and name in {"focal_px", "baseline_m"}) else "a number"
 
 
 def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from kornia_tidy.checks import check_positive, unmasked
+from kornia_tidy.checks import check_count, check_positive, unmasked
 
 WIDEST_CROSSTALK = 1000  # pixels, standard deviation; wider than any panel
 _SLACK = 1e-3  # rad beyond 0 to 4 pi, by rounding in a file
@@ -32,8 +32,7 @@ def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
         >>> level_phases(2) / math.pi
         tensor([0.0000, 0.5000, 1.0000, 1.5000], dtype=torch.float64)
     """
-    if not isinstance(bits, int) or not 1 <= bits <= 10:
-        raise ValueError(f"bits must be a whole number from 1 to 10, got {bits}")
+    check_count("bits", bits, most=10)
     check_positive("phase_range", phase_range, "radians")
     return torch.arange(2**bits, dtype=torch.float64) * (phase_range / 2**bits)
 

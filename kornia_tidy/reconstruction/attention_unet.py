@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_tidy.reconstruction.head import check_count
+from kornia_tidy.checks import check_count
 from kornia_tidy.reconstruction.unet import UNet, conv_block, conv_unit
 
 

@@ -9,12 +9,11 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_float_tensor, check_not_negative
+from kornia_tidy.checks import check_choice, check_count, check_float_tensor, check_not_negative
 from kornia_tidy.choices import INVERSES
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
-from kornia_tidy.reconstruction.head import check_count
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.predicted_error import best_wiener_kernels
 from kornia_tidy.reconstruction.tikhonov_kernels import tikhonov_kernels

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.checks import check_count, check_float_tensor
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import check_head_image, layout_remedy
 
@@ -117,12 +117,6 @@ def sharing_weights(head: nn.Module) -> nn.Module:
         (False, True)
     """
     return copy.deepcopy(head, {id(tensor): tensor for tensor in (*head.parameters(), *head.buffers())})
-
-
-def check_count(name: str, value: int, least: int = 1) -> None:
-    """Raise ``ValueError`` unless ``value`` is a whole number of at least ``least``."""
-    if not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
 
 
 def border_padding(size: tuple[int, int], multiple: int) -> tuple[tuple[int, int, int, int], str]:

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import printed
+from kornia_tidy.checks import check_count, printed
 from kornia_tidy.reconstruction.closed_form import LEAST, closed_form_channels, with_image
 from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.guided_classes import REDUCTION, smoothed_classes
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.residual import zero_last_convolution
 
 

@@ -8,12 +8,12 @@ import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
-from kornia_tidy.checks import check_positive, printed
+from kornia_tidy.checks import check_count, check_positive, printed
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.closed_form import LEAST, SHARPNESS
 from kornia_tidy.reconstruction.depth_distribution import depth_moments, interpolated_classes, layer_weights
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.reconstruction.residual import zero_last_convolution
 from kornia_tidy.reconstruction.tikhonov import transfer_function

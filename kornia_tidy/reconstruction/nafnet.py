@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.checks import check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 
 ENCODER = (1, 1, 1, 1)  # blocks of each level
 MIDDLE = 2

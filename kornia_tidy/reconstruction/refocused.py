@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from kornia_tidy.checks import check_count
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
 from kornia_tidy.render.borders import next_fast_size
 

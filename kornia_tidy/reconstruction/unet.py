@@ -8,7 +8,8 @@ from itertools import pairwise
 from torch import Tensor, nn
 from torch.nn import functional
 
-from kornia_tidy.reconstruction.head import ReconstructionHead, check_count
+from kornia_tidy.checks import check_count
+from kornia_tidy.reconstruction.head import ReconstructionHead
 
 LEVELS = 5
 

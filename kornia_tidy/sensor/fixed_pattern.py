@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_finite, check_float_tensor, check_generator, check_number, described
+from kornia_tidy.checks import check_count, check_finite, check_float_tensor, check_generator, check_number
 
 MAPS = "(H, W) or (C, H, W) of the whole sensor, with 1 in the place of H or W where rows or columns are alike"
 
@@ -48,8 +48,7 @@ def draw_pattern(
         ([1.0], True)
     """
     for name, side in (("height", height), ("width", width)):
-        if not isinstance(side, int) or side < 1:
-            raise ValueError(f"{name} must be a whole number of pixels, 1 or more, got {described(side)}")
+        check_count(name, side)
     check_generator(generator)
     for name, value in (("response", response), ("dark", dark), ("columns", columns)):
         check_number(name, value, "as a standard deviation")

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from kornia_tidy.checks import (
     check_choice,
+    check_count,
     check_float_tensor,
     check_generator,
     check_not_negative,
@@ -24,7 +25,7 @@ from kornia_tidy.kernels.precision import safe_sqrt
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.units import NONSENSE_CODE, check_image, warn_once
 from kornia_tidy.sensor.fixed_pattern import check_pattern, pattern_at
-from kornia_tidy.sensor.steps import check_bits
+from kornia_tidy.sensor.steps import MOST_BITS
 
 STRIP = 64  # rows of noise drawn in one call
 MOST_ELECTRONS = 1e30  # of a full well, and the least is its inverse: beyond, float32 has no ratios of electrons
@@ -243,7 +244,7 @@ class SensorNoise(Sensor):
                 f"dark needs full_well, the number of electrons at full scale, got dark = {dark} without it"
             )
         if bits is not None:
-            check_bits(bits)
+            check_count("bits", bits, most=MOST_BITS)
         self.sigma, self.full_well, self.dark, self.bits, self.clip = sigma, full_well, dark, bits, clip
         for name, plane in (("response", response), ("offset", offset)):
             check_pattern(name, plane)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_float_tensor, check_values
+from kornia_tidy.checks import check_count, check_float_tensor, check_values
 from kornia_tidy.kernels.pixel_ops import quantized, record
+
+MOST_BITS = 16  # of a converter
 
 
 def shot_noise(electrons: Tensor, uniform: Tensor) -> Tensor:
@@ -74,11 +76,5 @@ def quantize(image: Tensor, bits: int) -> Tensor:
         tensor([0., 1., 2., 3., 4.])
     """
     check_float_tensor("image", image, image.ndim, "")
-    check_bits(bits)
+    check_count("bits", bits, most=MOST_BITS)
     return quantized(image.to(torch.promote_types(image.dtype, torch.float32)), bits).to(image.dtype)
-
-
-def check_bits(bits: int) -> None:
-    """Raise ``ValueError`` unless this is a number of bits that a converter may have."""
-    if not isinstance(bits, int) or not 1 <= bits <= 16:
-        raise ValueError(f"bits must be a whole number from 1 to 16, got {bits}")

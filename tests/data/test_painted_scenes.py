@@ -86,14 +86,14 @@ class TestEveryPainter(BaseTester):
     @pytest.mark.parametrize(
         ("changed", "message"),
         [
-            ({"height": 0}, "height must be a positive integer, got 0"),
-            ({"width": 2.5}, "width must be a positive integer, got 2.5"),
-            ({"seed": -1}, "seed must be an integer of 0 or more, got -1"),
+            ({"height": 0}, "height must be a whole number of at least 1, got 0"),
+            ({"width": 2.5}, "width must be a whole number of at least 1, got 2.5"),
+            ({"seed": -1}, "seed must be a whole number of at least 0, got -1"),
             ({"depth_range": (0.0, 1.0)}, r"0 < near < far, got \(0.0, 1.0\)"),
             ({"depth_range": (2.0, 1.0)}, r"0 < near < far, got \(2.0, 1.0\)"),
             ({"depth_range": (float("nan"), 1.0)}, "0 < near < far"),
             ({"depth_range": (float("inf"), float("inf"))}, "0 < near < far"),
-            ({"length": 0}, "length must be a positive integer, got 0"),
+            ({"length": 0}, "length must be a whole number of at least 1, got 0"),
         ],
     )
     def test_exception_names_the_bad_value_before_any_item_is_asked_for(self, painters, kind, changed, message):
@@ -106,7 +106,7 @@ class TestEveryPainter(BaseTester):
 
 
 def test_exception_what_one_kind_alone_takes():
-    with pytest.raises(ValueError, match="num_leaves must be a positive integer, got -3"):
+    with pytest.raises(ValueError, match="num_leaves must be a whole number of at least 1, got -3"):
         dead_leaves(8, 8, num_leaves=-3)
     for call in (partial(photo_collage, [], 8, 8), partial(PhotoCollages, [], 2, 8, 8)):
         with pytest.raises(ValueError, match="photographs must hold one path or more, got none"):

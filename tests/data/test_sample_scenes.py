@@ -52,7 +52,7 @@ class TestSampleScene(BaseTester):
 
     @pytest.mark.parametrize("height", [0, 2.5])
     def test_exception_height(self, height):
-        with pytest.raises(ValueError, match=f"height must be a positive integer, got {height}"):
+        with pytest.raises(ValueError, match=f"height must be a whole number of at least 1, got {height}"):
             sample_scene(height=height)
 
     def test_exception_unknown_name(self):

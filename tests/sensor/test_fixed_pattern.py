@@ -44,7 +44,7 @@ class TestDrawPattern(BaseTester):
         ("options", "sentence"),
         [
             ({"response": 0.4}, "response must be a standard deviation from 0 to 0.3, got 0.4"),
-            ({"height": -1}, "height must be a whole number of pixels, 1 or more, got the number -1"),
+            ({"height": -1}, "height must be a whole number of at least 1, got -1"),
             ({"dark": -1e-3}, "dark must be a standard deviation zero or positive and finite, got -0.001"),
         ],
     )

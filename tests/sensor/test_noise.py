@@ -29,7 +29,7 @@ def gradient_of(function, at: torch.Tensor) -> torch.Tensor:
 class TestQuantize(BaseTester):
     @pytest.mark.parametrize("bits", [0, 17, -1, 8.0, "8"])
     def test_exception_names_the_bits(self, device, bits):
-        with pytest.raises(ValueError, match=f"bits must be a whole number from 1 to 16, got {bits}"):
+        with pytest.raises(ValueError, match=f"bits must be a whole number from 1 to 16, got {bits!r}"):
             quantize(torch.zeros(1, device=device), bits)
 
     @pytest.mark.parametrize("bits", [1, 2, 8, 12, 16])
