@@ -77,7 +77,7 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
     """Return the output paths of each file.
 
     Args:
-        files: inputs; one that is named twice counts once.
+        files: inputs; one that is named twice counts once, by whichever path.
         folder: of the outputs.
         suffixes: replacements of a file's suffix, one for each output.
 
@@ -85,12 +85,13 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
         ValueError: if two files would become the same picture, or a picture would replace one of the files.
 
     Example:
-        >>> output_paths(["shots/a.dng"], Path("sharp"), [".png", ".json"])
+        >>> output_paths(["shots/a.dng", "shots/../shots/a.dng"], Path("sharp"), [".png", ".json"])
         {'shots/a.dng': [PosixPath('sharp/a.png'), PosixPath('sharp/a.json')]}
     """
     outputs: dict[str, list[Path]] = {}
     owners: dict[str, str] = {}
-    for path in dict.fromkeys(files):
+    first = {Path(path).resolve(): path for path in reversed(files)}
+    for path in dict.fromkeys(first[Path(path).resolve()] for path in files):
         stem = Path(path).stem
         if stem in owners:
             raise ValueError(f"{owners[stem]} and {path} would both become {folder / stem}{suffixes[0]}")

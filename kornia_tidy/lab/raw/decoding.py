@@ -230,4 +230,4 @@ def _too_much(memory_limit: int) -> str:
 
 
 def _memory(limit: int) -> str:
-    return f"the {limit / 2**20:.0f} MiB of memory that it may use"
+    return f"the {f'{limit / 2**20:.0f} MiB' if limit >= 1 << 20 else f'{limit} bytes'} of memory that it may use"
