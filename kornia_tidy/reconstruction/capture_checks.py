@@ -25,9 +25,11 @@ JPEG = 1.1  # least factor of blocks: 1.00 to 1.03 without compression, 1.27 and
 JPEG_NOISE = 0.008  # of even noise: of .006, .008 and .01 the best for a quality of 92, four scenes of half A
 FALLING = -0.2  # of the variance in the dark for full light: noise of light rises with it, in encoded pictures it falls
 TWICE = 2.0  # a stated noise is doubted beyond this factor
+SHORTEST = 64  # px of a row or column whose median is its level
 SAMPLED = 512  # px of a row, whose median is its level
 BANDS = 3.0  # a factor by which steps between rows exceed those between columns, or the reverse
 FAINT_BAND = 0.15  # of the noise: weaker bands stay
+OF_MEDIANS = 4.0  # of the noise, for the median of one pixel: 3 times its deviation
 WHITE = 2.8  # least ratio of fourth to second differences: 3.4 for bands, and 1.4 for waves of five rows
 LAW = 0.25  # standard deviation of the logarithm of variances over a sensor's law; .05 to .21 where it holds
 
@@ -109,7 +111,7 @@ def repair_bands(light: Tensor, noise: float) -> WithoutBands:
     :math:`|D^2 l - m|^2 / v + |l|^2 / b^2`, v the variance that the scene leaves, :math:`b^2` that of bands.
 
     Args:
-        light: (C, H, W) linear light.
+        light: (C, H, W) linear light. It stays as it is where a side is shorter than 64 pixels.
         noise: standard deviation of its noise.
 
     Example:
@@ -119,15 +121,15 @@ def repair_bands(light: Tensor, noise: float) -> WithoutBands:
         >>> round(repaired.size, 2), bool((repaired.light[:, ::2].mean() - repaired.light[:, 1::2].mean()).abs() < 1e-3)
         (0.02, True)
     """
-    if min(light.shape[-2:]) < BLOCK + 2:
+    if min(light.shape[-2:]) < SHORTEST:
         return WithoutBands(light, 0.0)
     steps = [_steps(part) for part in (light, light.transpose(1, 2))]
     spreads = [_spread(step) for step in steps]
     size = math.sqrt(abs(spreads[0] ** 2 - spreads[1] ** 2) / 6)
     rows = spreads[0] > spreads[1]
-    along = steps[0 if rows else 1]
-    faint = max(spreads) <= BANDS * min(spreads) or size <= FAINT_BAND * noise
-    if faint or _spread(along.diff(n=2)) < WHITE * max(spreads):
+    along, across = (steps[0], steps[1]) if rows else (steps[1], steps[0])
+    least = max(FAINT_BAND, OF_MEDIANS / math.sqrt(min(len(across), SAMPLED))) * noise
+    if max(spreads) <= BANDS * min(spreads) or size <= least or _spread(along.diff(n=2)) < WHITE * max(spreads):
         return WithoutBands(light, 0.0)
     levels = _levels(along, max(min(spreads) ** 2 / size**2, 1e-3))
     known = light < CLIPPED

@@ -105,7 +105,9 @@ class TestRepairBands(BaseTester):
             assert repair_bands(light + stripes[:, None], 0.002).size == 0
 
     def test_feature_too_small(self):
-        assert repair_bands(torch.rand(3, 9, 200), 0.01).size == 0
+        light = 0.5 + 0.1 * torch.randn(1, 200, generator=torch.Generator().manual_seed(0)).expand(3, 63, 200)
+        assert repair_bands(light, 0.01).size == 0
+        assert repair_bands(torch.cat([light, light[:, :1]], 1), 0.01).size > 0
 
 
 def jpeg(light, quality):
