@@ -74,16 +74,16 @@ class DesignTask(DesignSettings):
         if self.full_well is not None:
             check_positive("full_well", self.full_well)
         self.sensor(self.reference_f_number)  # refuses light and noise out of range
-        self.camera(max(self.reference_f_number, FASTEST), 0.5)  # and depths out of order
         near, far = self.depth_range
-        if near <= 2 * self.focal_length:
-            raise ValueError(
-                f"depth_range must begin beyond two focal lengths, {2 * self.focal_length:g} m, got {near:g} m"
-            )
-        if self.balanced_f_number < SLOWEST_LENS:
+        if 0 < near < far and self.balanced_f_number < SLOWEST_LENS:
             raise ValueError(
                 f"depths from {near:g} to {far:g} m are all in focus with a lens of {self.focal_length:g} m at "
                 f"f/{self.balanced_f_number:.2g}: if they are millimetres, multiply them by 0.001"
+            )
+        self.camera(max(self.reference_f_number, FASTEST), 0.5)  # refuses depths out of order
+        if near <= 2 * self.focal_length:
+            raise ValueError(
+                f"depth_range must begin beyond two focal lengths, {2 * self.focal_length:g} m, got {near:g} m"
             )
 
     @property
