@@ -27,7 +27,7 @@ class PSFMeasures:
         defocus: radians.
         channels: names, such as ``"530 nm"``.
         psfs: (D, C, P, P), share of a point's light in each pixel.
-        strehl: (D, C), peaks relative to that of the same lens in focus without a mask.
+        strehl: (D, C), peaks relative to that of an ideal lens in focus without a mask.
         contrast: (D, C, F) MTF in rings of equal width from 0 to 0.5 cycles per pixel.
         focus: (S,) radians of the slice through focus, ascending.
         slices: (S, P) middle rows of the middle channel's PSFs there.
@@ -86,7 +86,7 @@ def measures_of_psfs(optics: TiDyOptics, defocus: Tensor) -> PSFMeasures:
 
 
 def _without_mask(optics: TiDyOptics) -> Tensor:
-    """Return the in-focus PSFs of the same lens with a flat mask, (1, C, P, P)."""
+    """Return the in-focus PSFs of an ideal lens of the same aperture with a flat mask, (1, C, P, P)."""
     rows, columns = optics.masks.phase.shape[-2:]
     masks = PixelwiseMask(1, (rows, columns), initial="flat")
     plain = TiDyOptics(

@@ -18,10 +18,12 @@ from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.field_table import defocus_terms
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.lens.lens_table import LensTable, degree_of, modes_of
+from kornia_tidy.optics.lens.rays import Array
 from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrature
 from kornia_tidy.optics.quadrature import band_limited_quadrature
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
+from kornia_tidy.psf.psf_cache import PSFMemory, values_of
 from kornia_tidy.psf.scattered_transform import scattered_energies, scattered_grid
 
 _FEWEST = 4  # points along a patch, for its amplitude and its edges
@@ -31,6 +33,7 @@ _GRID = 21  # points along the stop at which the steepest phase is looked for
 _HEIGHTS = 5  # in the lens's field, where it is looked for
 _MARGIN = 1.02  # of the highest frequency, between these points
 _MEMORY = 1 << 24  # bytes of points at once
+_AT_ONCE = 1 << 14  # points whose polynomials are computed at once: arrays that a cache holds
 _SMOOTH = 8  # least degree of polynomials for the light over the stop
 
 
@@ -156,7 +159,9 @@ def lens_psfs(
                 for first, side, stop in zip(firsts, sides, stops, strict=True)
             ]
         )
-        basis = torch.cat([stop.polynomials for stop in stops], 1).flatten(1)
+        basis = (
+            torch.cat([stop.polynomials for stop in stops], 1) if len(stops) > 1 else stops[0].polynomials
+        ).flatten(1)
         weight = torch.cat([stop.points.weight for stop in stops]) * scale
         terms = seen[0].phase_terms, seen[0].terms["amplitude"]
         rows, many = _rows(seen, -scale / grid.step, (grid.extent - 1) / 2), 2 + terms[0].shape[1]
@@ -302,30 +307,34 @@ def _mirrored(values: Tensor, mirror: tuple[bool, bool]) -> Tensor:
 def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:
     """Return the open stop cell by cell, as finely as the phase asks, which changes by so much over half a cell."""
     parts = max(1, math.ceil(half / _LONGEST))
-    discs = tuple(map(tuple, turned.discs().tolist()))
-    asked = half / parts, tolerance
-    return _stop_points(tuple(map(tuple, spans.tolist())), parts, asked, discs, turned.degree, turned.shift)
+    given = parts, (half / parts, tolerance), turned.discs(), turned.degree, turned.shift
+    key = (*given[:2], *values_of(given[2], spans), *given[3:])
+    *points, polynomials, moments = _STOPS.recall(key, (0.0,), lambda _: _stop_points(spans.numpy(), *given))
+    return Stop(StopQuadrature(*(part[0] for part in points)), polynomials[0], moments[0])
 
 
-@lru_cache(maxsize=8)
 def _stop_points(
-    spans: tuple[tuple[float, ...], ...],
-    parts: int,
-    asked: tuple[float, float],
-    discs: tuple[tuple[float, ...], ...],
-    degree: int,
-    shift: tuple[float, float],
-) -> Stop:
-    with torch.inference_mode(False):
-        begin, end = np.array(spans)
-        steps = np.arange(parts + 1) / parts
-        edges = begin[:, None] + (end - begin)[:, None] * steps
-        fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
-        points = stop_quadrature(fine, band_limited_quadrature(*asked, _FEWEST), np.array(discs), shift)
-        points = StopQuadrature(points.row // parts, points.column // parts, points.x, points.y, points.weight)
-        count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
-        polynomials = zernike_polynomials(max(count, smooth), points.y, points.x)
-        return Stop(points, polynomials[:count].clone(), (polynomials[:smooth] * points.weight).sum(-1))
+    spans: Array, parts: int, asked: tuple[float, float], discs: Tensor, degree: int, shift: tuple[float, float]
+) -> tuple[Tensor, ...]:
+    """Return the parts of a stop with an axis of one before, as they are remembered."""
+    begin, end = spans
+    steps = np.arange(parts + 1) / parts
+    edges = begin[:, None] + (end - begin)[:, None] * steps
+    fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
+    points = stop_quadrature(fine, band_limited_quadrature(*asked, _FEWEST), discs.numpy(), shift)
+    count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
+    polynomials = points.x.new_empty(count, *points.x.shape)
+    moments = points.x.new_empty(smooth, len(points.x))
+    at_once = max(1, _AT_ONCE // points.x.shape[1])  # patches
+    for part in (slice(n, n + at_once) for n in range(0, len(points.x), at_once)):
+        found = zernike_polynomials(smooth, points.y[part], points.x[part])
+        polynomials[:, part] = found[:count]
+        moments[:, part] = (found * points.weight[part]).sum(-1)
+    whole = points.row // parts, points.column // parts, points.x, points.y, points.weight, polynomials, moments
+    return tuple(part[None] for part in whole)
+
+
+_STOPS = PSFMemory(128 << 20)
 
 
 def _count(degree: int) -> int:

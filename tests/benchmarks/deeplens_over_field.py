@@ -38,13 +38,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(1110, 1282), help="rows and columns (1110 1282)")
     parser.add_argument("--window", type=int, default=23, help="side of the PSFs in pixels (23)")
     parser.add_argument("--cell", type=int, default=160, help="side of DeepLens's cells in pixels (160)")
+    parser.add_argument("--tolerance", type=float, default=2e-2, help="of the tiles, Fidelity.field_tolerance (0.02)")
     parser.add_argument("--rounds", type=int, default=3, help="of which the least time counts (3)")
     args = parser.parse_args(arguments)
     source = args.folder / "deeplens" / "imgsim" / "psf.py"
     if not source.is_file():
         sys.exit(f"{source}: no such file: clone github.com/vccimaging/DeepLens and name its folder")
     torch.set_num_threads(1)
-    compare(_function(source), tuple(args.size), args.window, args.cell, args.rounds)
+    compare(_function(source), tuple(args.size), args.window, args.cell, args.tolerance, args.rounds)
 
 
 def _function(source: Path) -> Callable[..., Tensor]:
@@ -57,25 +58,30 @@ def _function(source: Path) -> Callable[..., Tensor]:
 
 
 @torch.no_grad()
-def compare(by_map: Callable[..., Tensor], size: tuple[int, int], window: int, cell: int, rounds: int) -> None:
+def compare(
+    by_map: Callable[..., Tensor], size: tuple[int, int], window: int, cell: int, tolerance: float, rounds: int
+) -> None:
     """Print times and largest and mean errors of both ways."""
     image, depth = (part[None] for part in dead_leaves(*size, num_leaves=size[0] * size[1] // 3000))
     masks = PixelwiseMask(5, generator=torch.Generator().manual_seed(3))
     optics = TiDyOptics(masks, fidelity=Fidelity(window=window), lens=LENS)
     psi = optics.camera.defocus(depth)
-    field = optics.psf_model.field_of(size)
-    assert field is not None
-    bank = optics.psf_model.scene_bank(3, image.dtype, psi, field=field)
+    given = []
+    for own in (optics, optics.with_fidelity(optics.fidelity.replace(field_tolerance=tolerance))):
+        field = own.psf_model.field_of(size)
+        assert field is not None
+        given.append((own.psf_model.scene_bank(3, image.dtype, psi, field=field), field))
+    (fine, of_fine), (bank, field) = given  # the map's PSFs do not suffer from the tolerance of the tiles
     grid = tuple(max(1, round(side / cell)) for side in size)
     middles = [[(2 * i + 1) * side / (2 * n) - 0.5 for i in range(n)] for side, n in zip(size, grid, strict=True)]
-    cells = torch.stack([bank.between(field, (y, x)).psfs for y in middles[0] for x in middles[1]])
-    given = -1 / (psi - bank.defocus[0] + 1), cells.unflatten(0, grid), -1 / (bank.defocus - bank.defocus[0] + 1)
+    cells = torch.stack([fine.between(of_fine, (y, x)).psfs for y in middles[0] for x in middles[1]])
+    mapped = -1 / (psi - bank.defocus[0] + 1), cells.unflatten(0, grid), -1 / (bank.defocus - bank.defocus[0] + 1)
 
     def tiles() -> Tensor:
         return render_over_field(image, psi, bank, field, Rendering("gather", "reflect"))
 
     def deeplens() -> Tensor:
-        return by_map(image, *given, interp_mode="disparity")
+        return by_map(image, *mapped, interp_mode="disparity")
 
     seen = tiles(), deeplens()
     generator, exact = torch.Generator().manual_seed(0), []

@@ -54,8 +54,7 @@ class Psf:
     Printed for each depth and colour:
       held    share of a point's light inside the window (ensquared energy)
       peak    share of the light in the brightest pixel
-      Strehl  the peak relative to that of the same lens in focus without a mask;
-              with --field to that of an ideal lens
+      Strehl  the peak relative to that of an ideal lens in focus without a mask
       MTF50   spatial frequency at which contrast falls to one half, in cycles per
               pixel; 0.5 is the Nyquist limit
 
