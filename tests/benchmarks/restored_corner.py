@@ -2,7 +2,7 @@
 
 ``python -m tests.benchmarks.restored_corner``; half an hour. The same scenes in both places: the middles of real ones
 where they are on the machine, and painted ones. Decibels below the centre: the corner by the PSFs over the field and by
-those of the axis; and what the lens costs the best linear filter of each scene, which least squares find with the truth
+those of the axis; and what the lens costs the best linear filter, which least squares find with the truth of all scenes
 at hand: a closed form that loses more than this has a fault of its own.
 """
 
@@ -20,7 +20,7 @@ from torch.nn.functional import unfold
 from kornia_tidy import Fidelity, FresnelLens, NoMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import photographic_leaves
 from kornia_tidy.masks import CubicMask, PhaseMasks, PixelwiseMask, SpiralMask, initial_heights
-from kornia_tidy.optics import SYSTEMS, Lens, ThinLensCamera
+from kornia_tidy.optics import Lens, ThinLensCamera
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
@@ -34,10 +34,10 @@ PICTURE, PITCH = (1110, 1282), 8e-6
 WINDOW = 65  # px of the PSFs
 DEFOCUS = 20.0  # rad, the most on either side of focus
 MARGIN = 16  # px at the edges that are not scored
-FILTER = 25  # px along a side of the best linear filter
+FILTER, TURNS = 25, 6  # px along a side of the best linear filter, and weighted turns to find it
+ELEMENTS = ("chang2019", "sitzmann2018")  # published systems that are single elements
 CASES = (
-    "edof-5", "edof-designed", "spiral", "focal sweep", "cubic", "fresnel", "none", "none f/11", "none f/25",
-    "chang2019", "sitzmann2018",
+    "edof-5", "edof-designed", "spiral", "focal sweep", "cubic", "fresnel", "none", "none f/11", "none f/25", *ELEMENTS
 )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def camera_of(name: str) -> TiDyOptics:
     Masks are learnt, drawn by a seed, lenses of several powers, a cubic or a diffractive lens.
     """
     fidelity = Fidelity(window=WINDOW, stray_light="veil")
-    if name in SYSTEMS:
+    if name in ELEMENTS:
         return TiDyOptics.from_preset(name, lens="own", fidelity=fidelity, sensor=None, compositing="gather")
     random = torch.Generator().manual_seed(3)
     kind, _, number = name.partition(" f/")
@@ -105,31 +105,37 @@ class Place:
         return by_place, by_axis
 
 
-def best_filtered(seen: Tensor, image: Tensor) -> Tensor:
-    r"""Return a capture's inner part restored by the filter of least squared error in sRGB, a colour by its own.
+def best_filtered(seen: Sequence[Tensor], images: Sequence[Tensor]) -> list[Tensor]:
+    r"""Return the inner parts of captures restored by the one filter of the best mean PSNR, a colour by its own.
 
-    .. math:: \min_k \sum_x g'(t_x)^2 \, \big( (k * y)_x - t_x \big)^2
+    .. math:: \min_k \sum_n \log \sum_x g'(t_{nx})^2 \, \big( (k * y_n)_x - t_{nx} \big)^2
 
-    with the curve g of sRGB, whose error is g' times that of linear light.
+    with the curve g of sRGB, whose error is g' times that of linear light. By least squares, weighted by turns.
 
     Args:
-        seen: linear light (1, 3, H, W).
-        image: the truth, encoded as sRGB.
+        seen: linear light of each capture, (1, 3, H, W).
+        images: the truth, encoded as sRGB.
     """
     inner = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
-    reach = FILTER // 2
-    around = seen[..., MARGIN - reach : reach - MARGIN, MARGIN - reach : reach - MARGIN]
-    truth = rgb_to_linear_rgb(image[inner])
-    curve = torch.where(truth > 0.0031308, 1.055 / 2.4 * truth.clamp(min=1e-4) ** (1 / 2.4 - 1), 12.92)
-    restored = []
-    for own, there, slope in zip(around[0], truth[0].flatten(1), curve[0].flatten(1), strict=True):
-        rows = unfold(own[None, None], FILTER)[0]
-        weighted = (rows * slope)[:, ::2]  # half of the pixels tell as much
-        squares = (weighted @ weighted.T).double()
-        squares += 1e-7 * squares.diagonal().mean() * torch.eye(len(squares), dtype=torch.float64)
-        kernel = torch.linalg.solve(squares, (weighted @ (slope * there)[::2]).double())
-        restored.append(kernel.float() @ rows)
-    return linear_rgb_to_rgb(torch.stack(restored).view_as(truth).clamp(0, 1))
+    reach = MARGIN - FILTER // 2
+    around = [unfold(light[..., reach:-reach, reach:-reach].movedim(1, 0), FILTER) for light in seen]  # (3, n, pixels)
+    squares, right, power = [], [], []
+    for rows, image in zip(around, images, strict=True):
+        truth = rgb_to_linear_rgb(image[inner])[0].flatten(1)[:, None, ::2]  # half of the pixels tell as much
+        slope = torch.where(truth > 0.0031308, 1.055 / 2.4 * truth.clamp(min=1e-4) ** (1 / 2.4 - 1), 12.92)
+        weighted, aim = rows[..., ::2] * slope, slope * truth
+        squares.append((weighted @ weighted.mT).double())
+        right.append((weighted @ aim.mT).double())
+        power.append(aim.double().square().sum())
+    whole, aims, share = torch.stack(squares), torch.stack(right), torch.ones(len(seen), 1, 1, 1).double()
+    whole += 1e-7 * whole.diagonal(dim1=-2, dim2=-1).mean() * torch.eye(FILTER**2, dtype=torch.float64)
+    kernels = aims[0]
+    for _ in range(TURNS):
+        kernels = torch.linalg.solve((share * whole).sum(0), (share * aims).sum(0))
+        left = torch.stack(power) + (kernels.mT @ (whole @ kernels - 2 * aims)).sum((1, 2, 3))
+        share = 1 / left[:, None, None, None]
+    restored = [(kernels.mT.float() @ rows).view_as(image[inner]) for rows, image in zip(around, images, strict=True)]
+    return [linear_rgb_to_rgb(part.clamp(0, 1)) for part in restored]
 
 
 @torch.no_grad()
@@ -148,18 +154,26 @@ def losses(family: str, side: int, count: int, head: str) -> list[str]:
     for electrons in ELECTRONS:
         sensor = SensorNoise(READ_ELECTRONS / electrons, full_well=electrons)
         heads = [place.heads(sensor) for place in places]
+        generators = [[torch.Generator().manual_seed(0) for _ in places] for _ in own]
+        seen = [
+            [sensor(light.clamp(0, 1), generator=one) for light, one in zip(*pair, strict=True)]
+            for pair in zip(lights, generators, strict=True)
+        ]
+        images = [image for _, image, _ in own]
+        best_of = [best_filtered([pair[i] for pair in seen], images) for i in (0, 1)]
         scored: list[list[float]] = []
-        for (name, image, _), pair in zip(own, lights, strict=True):
-            seen = [sensor(light.clamp(0, 1), generator=torch.Generator().manual_seed(0)) for light in pair]
+        for n, (name, image, _) in enumerate(own):
             found = []
-            for form, light in ((heads[0][0], seen[0]), (heads[1][0], seen[1]), (heads[1][1], seen[1])):
-                restored = reconstruct_light(form, light[0]).image
+            for form, i in ((heads[0][0], 0), (heads[1][0], 1), (heads[1][1], 1)):
+                restored = reconstruct_light(form, seen[n][i][0]).image
                 assert restored is not None
                 found.append(restored[None][inner])
-            found += [best_filtered(light, image) for light in seen]
+            found += [best_of[0][n], best_of[1][n]]
             scored.append([float(psnr(part, image[inner])) for part in found])
-            words = " ".join(f"{value:.2f}" for value in scored[-1])
-            print(f"  {family}, {electrons:.0f} e-, {name}: {words}", flush=True)
+            print(
+                f"  {family}, {electrons:.0f} e-, {name}: {' '.join(f'{value:.2f}' for value in scored[-1])}",
+                flush=True,
+            )
         centre, by_field, by_axis, best, best_there = torch.tensor(scored).T
         lost = [centre - by_field, centre - by_axis, best - best_there, centre - by_field - best + best_there]
         cells = [f"{float(part.mean()):.2f} (worst {float(part.max()):.2f})" for part in lost]
