@@ -126,14 +126,13 @@ def fisher_information(response: PointResponse, photons: float = PHOTONS, backgr
     return torch.einsum("idcyx,jdcyx->dij", derivatives / divisor, derivatives)
 
 
-def defocus_bound(information: Tensor, known_position: bool = False) -> Tensor:
+def defocus_bound(information: Tensor) -> Tensor:
     r"""Return the square root of the Cramér-Rao bound on defocus from Fisher information, in radians, (D,).
 
     .. math:: \sqrt{[I^{-1}]_{\psi\psi}} = (I_{\psi\psi} - I_{\psi p} I_{pp}^{-1} I_{p\psi})^{-1/2}
 
     Args:
-        information: (D, 3, 3) of defocus, x and y.
-        known_position: whether the point's position is known and need not be estimated from the same image.
+        information: (D, 3, 3) of defocus and of the point's place x and y, which is estimated from the same image.
 
     Returns:
         Standard deviation in radians. It is ``inf``, without gradient, where the image does not change with defocus,
@@ -143,10 +142,8 @@ def defocus_bound(information: Tensor, known_position: bool = False) -> Tensor:
         >>> defocus_bound(torch.diag(torch.tensor([100.0, 4.0, 4.0]))[None])
         tensor([0.1000])
     """
-    effective = information[:, 0, 0]
-    if not known_position:
-        mixed = information[:, 0, 1:, None]
-        effective = effective - (mixed.mT @ torch.linalg.solve(information[:, 1:, 1:], mixed)).flatten()
+    mixed = information[:, 0, 1:, None]
+    effective = information[:, 0, 0] - (mixed.mT @ torch.linalg.solve(information[:, 1:, 1:], mixed)).flatten()
     return effective.masked_fill(effective < _ROUNDING, 0).rsqrt()
 
 
@@ -155,7 +152,6 @@ def crlb(
     defocus: Sequence[float] | None = None,
     photons: float = PHOTONS,
     background: float = BACKGROUND,
-    known_position: bool = False,
 ) -> Tensor:
     r"""Return the square root of the Cramér-Rao bound on the defocus of a point imaged by a lens, in radians.
 
@@ -166,7 +162,6 @@ def crlb(
         defocus: nodes in radians at 530 nm. Default: those of the lens.
         photons: expected photons of the point in each channel; the point is grey.
         background: expected background photons in each pixel of each channel.
-        known_position: whether the point's position is known. By default x and y are estimated from the same image.
 
     Returns:
         (D,) float64, differentiable with respect to masks and modulator.
@@ -190,7 +185,7 @@ def crlb(
         >>> [round(value, 3) for value in crlb(flat, [-8.0, 0.0, 8.0]).tolist()]
         [0.041, inf, 0.041]
     """
-    return defocus_bound(fisher_information(defocus_response(lens, defocus), photons, background), known_position)
+    return defocus_bound(fisher_information(defocus_response(lens, defocus), photons, background))
 
 
 def _energies(field: Tensor, weights: Tensor, kernels: Tensor, step: float) -> tuple[Tensor, Tensor]:

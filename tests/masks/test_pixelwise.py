@@ -35,14 +35,6 @@ class TestPixelwiseMask(BaseTester):
         for material in (constant_index(1.5), FUSED_SILICA):
             self.assert_close(PixelwiseMask(initial=heights, material=material).heights(), heights, rtol=1e-6, atol=0)
 
-    def test_feature_half_precision_keeps_the_height(self):
-        """Radians keep their precision in half precision; metres of order 1e-7 would not."""
-        masks = PixelwiseMask()
-        before = masks.heights().detach()
-        after = masks.half().heights().detach()
-        assert after.dtype == torch.float32
-        assert float((after - before).abs().max()) < 1e-9
-
     @pytest.mark.parametrize("initial", ["nois", torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)])
     def test_exception_initial(self, initial):
         with pytest.raises(ValueError, match="initial"):
