@@ -9,7 +9,7 @@ farther apart for larger discs,
 because a change of a large disc is spread over its long edge. Discs of 24 pixels and more are smooth: their layers are
 convolved on a grid of 2, 4, 8, ... pixels, on which the radius is between 12 and 24. Errors are given in
 :data:`GRID_ERROR`, :data:`LAYER_ERROR` and :func:`ray_error`, root mean square for a scene with a standard deviation of
-:data:`SCENE_DEVIATION` of full scale (the Aloe scene), in linear light.
+0.19 of full scale (the Aloe scene), in linear light.
 
 All three arise at the edges of a PSF, which is an image of the aperture. Other apertures than the disc have longer
 edges, or edges that move farther with defocus. Their layers stand closer, and rays and grids begin at larger radii, by
@@ -31,7 +31,6 @@ from kornia_tidy.psf.pupil import Pupil
 LAYER_ERROR = 4.5e-4  # measured for discs of 0 to 50 px; half way between layers, which is the worst
 GRID_ERROR = 3.5e-4  # measured where the radius is 12 pixels of the grid; 1.5e-4 where it is 24
 RAY_TOLERANCE = 8e-4  # error of the geometric PSF from which on it is taken
-SCENE_DEVIATION = 0.19  # standard deviation of the light for which the errors above were measured
 FINE_RADIUS = 24.0  # pixels; up to here layers are convolved on the sensor's own pixels
 SMALLEST_WIDE_RADIUS = 18.0  # pixels; lenses with smaller discs keep evenly spaced layers
 _MARGIN = 6.0  # cycles per pupil radius around the disc: holds 98 % of the light or more, also in focus

@@ -68,19 +68,15 @@ class Backend(Protocol):
     @property
     def name(self) -> str:
         """What ``method=`` calls it."""
-        ...
 
     def refusal(self, scene: LayeredScene) -> str | None:
         """Return why it does not support a scene, as the end of a sentence, or None if it does."""
-        ...
 
     def work(self, scene: LayeredScene) -> Work:
         """Return the work of the forward pass, counted from the layers of the pixels and from no light or PSF."""
-        ...
 
     def render(self, scene: LayeredScene) -> Tensor:
         """Return (B, C, h, w) light, without the stray light of gather and scatter. Autograd does not record it."""
-        ...
 
     def gradients(self, scene: LayeredScene, gradient: Tensor) -> GradientPairs:
         """Return the gradients of tensors that were made of the scene's, where they require gradients.
@@ -89,4 +85,3 @@ class Backend(Protocol):
             scene: tensors that autograd records: image, layer weight, PSFs and, for occlusion, stray light.
             gradient: (B, C, h, w) gradient of what :meth:`render` returns.
         """
-        ...

@@ -30,8 +30,6 @@ COMPOSITINGS = ("gather", "scatter", "occlusion")
 BACKENDS: dict[str, Backend] = {
     backend.name: backend for backend in (DenseBackend(), CompiledBackend(), BatchedBackend())
 }
-# Earlier names of method=.
-RENAMED = {"direct": "compiled", "overlap": "compiled", "tiled": "batched", "triton": "batched"}
 # Where dense is the faster one: occlusion in C takes P^2 operations a pixel, and tiles of a small image through large
 # PSFs are as large as it. It is taken while an image with all channels has few bytes in float64.
 LARGEST_OCCLUSION, LARGEST_SHARE, LARGEST_PLANE = 65, 1 / 4, 32 << 20
@@ -139,8 +137,6 @@ def _keeps_little(scene: LayeredScene) -> bool:
 
 
 def _named(scene: LayeredScene, method: str) -> Backend:
-    if method in RENAMED:
-        raise ValueError(f"method {method!r} is now {RENAMED[method]!r}, or 'auto' for the backend that suits a scene")
     check_choice("method", method, ("auto", *BACKENDS))
     if (why := refusal(BACKENDS[method], scene)) is not None:
         raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")

@@ -10,7 +10,7 @@ from kornia_tidy import PSFBank
 from kornia_tidy.optics import REFERENCE_WAVELENGTH, annular_aperture, circular_aperture
 from kornia_tidy.psf.geometric_psf import geometric_psfs
 from kornia_tidy.psf.pupil import Pupil, pupil_over
-from kornia_tidy.psf.wide_blur import GRID_ERROR, SCENE_DEVIATION, window_of
+from kornia_tidy.psf.wide_blur import GRID_ERROR, window_of
 from kornia_tidy.render import gather
 from kornia_tidy.render.coarse_gather import _sharpened
 from kornia_tidy.render.dispatch import Rendering
@@ -50,12 +50,12 @@ def gather_group(image: torch.Tensor, defocus: torch.Tensor, group: Piece, borde
 
 
 def light(size: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-    """A scene as rough as photographs: edges of all sizes, with SCENE_DEVIATION."""
+    """A scene as rough as photographs: edges of all sizes, with the deviation for which the errors are given."""
     noise = torch.rand(1, 1, size, size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     f = torch.fft.fftfreq(size).double()
     spectrum = torch.fft.fft2(noise - noise.mean()) / (f[:, None].square() + f.square()).sqrt().clamp(min=1 / size)
     plane = torch.fft.ifft2(spectrum).real
-    return (0.5 + SCENE_DEVIATION * plane / plane.std()).to(dtype)
+    return (0.5 + 0.19 * plane / plane.std()).to(dtype)
 
 
 def kernels_of(group: Piece, radius: float, size: int) -> list[torch.Tensor]:

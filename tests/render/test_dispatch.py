@@ -85,12 +85,6 @@ class TestChoose(BaseTester):
         with pytest.raises(ValueError, match=message):
             render(*make_scene(bank), bank, method="sparse")
 
-    @pytest.mark.parametrize(("old", "new"), dispatch.RENAMED.items())
-    def test_exception_a_method_of_before_names_the_one_that_took_its_place(self, old, new):
-        bank = make_bank()
-        with pytest.raises(ValueError, match=f"^method '{old}' is now '{new}', or 'auto' .*"):
-            render(*make_scene(bank), bank, method=old)
-
     @pytest.mark.parametrize("method", [name for name in BACKENDS if name != "dense"])
     @over_compositing
     def test_exception_a_transform_of_torch_needs_dense(self, compositing, method):

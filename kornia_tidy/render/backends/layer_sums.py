@@ -33,15 +33,12 @@ class LayerSums(Protocol):
             correlate: through the PSFs turned by 180 degrees.
             weight_gradient: the derivative with respect to the layer weight instead.
         """
-        ...
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return (B, C, h + P - 1, w + P - 1) of pixels (B, C, h, w); of a scattered capture its middle is enough."""
-        ...
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return (D, C, P, P) of a plane and of pixels, turned where gather and scatter take the PSFs turned."""
-        ...
 
 
 def present_in_tiles(labels: Labels, tile: tuple[int, int], layers: int, reach: int = 0, step: int = 1) -> Tensor:
