@@ -104,10 +104,15 @@ class TestNumerics(BaseTester):
 
 
 class TestChoice(BaseTester):
-    @pytest.mark.parametrize(("states", "cells"), [(1, 12), (6, 4)])
-    def test_feature_the_way_with_fewer_operations_is_taken(self, states, cells):
+    @pytest.mark.parametrize(("states", "cells"), [(1, 46), (1, 12), (6, 4)])
+    @pytest.mark.parametrize("in_c", [True, False])
+    def test_feature_the_way_with_fewer_operations_is_taken_where_those_in_c_count_less(
+        self, states, cells, in_c, monkeypatch
+    ):
+        monkeypatch.setattr(energies, "goes_in_c", lambda *_: in_c and compiled(SOURCE, torch.float32) is not None)
         case = random_case(states, cells, 2, 5, 2)
         by_waves, by_intensity = energy_operations(states, 5, 2, cells)
-        assert (by_intensity < by_waves) == (states == 6)
-        taken = mutual_energies if states == 6 else wave_energies
+        assert by_intensity / by_waves == pytest.approx({46: 2.98, 12: 1.94, 4: 0.70}[cells], abs=0.01)
+        mutual = states == 6 or (energies.goes_in_c() and cells == 12)
+        taken = mutual_energies if mutual else wave_energies
         assert torch.equal(pixel_energies(*case), taken(*case))
