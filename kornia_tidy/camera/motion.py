@@ -12,7 +12,6 @@ from torch import Tensor
 from kornia_tidy.camera.samples import check_light, compute_dtype, read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_float_tensor, check_part
-from kornia_tidy.modulator.modulator import Timeline
 
 
 def moving_capture(
@@ -116,29 +115,8 @@ def moment_times(optics: TiDyOptics) -> Tensor:
         >>> moment_times(TiDyOptics(PixelwiseMask(2), modulator=DwellTimes((1, 3))))
         tensor([0.1250, 0.6250])
     """
-    return _timeline(optics).moment_times().detach()
-
-
-def state_times(optics: TiDyOptics) -> Tensor:
-    """Return the mean time at which each state of the exposure is shown, as a share of the exposure in [0, 1].
-
-    A permanent state is shown in the middle. For scenes, see :func:`moment_times`.
-
-    Args:
-        optics: the camera.
-
-    Returns:
-        (S,) float32 or better, in the modulator's order.
-
-    Example:
-        >>> state_times(TiDyOptics.from_preset("ikoma2021"))
-        tensor([0.5000, 0.5000])
-    """
-    return _timeline(optics).state_times().detach()
-
-
-def _timeline(optics: TiDyOptics) -> Timeline:
-    return optics.timeline(torch.promote_types(optics.masks.phase.dtype, torch.float32))
+    dtype = torch.promote_types(optics.masks.phase.dtype, torch.float32)
+    return optics.timeline(dtype).moment_times().detach()
 
 
 def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:

@@ -252,19 +252,16 @@ class PSFModel:
             raise ValueError(f"defocus must be within {MOST_DEFOCUS:g} rad to be computed, got {max(defocus, key=abs)}")
         spectrum = self.spectrum_of(len(self.spectrum.weights) if channels is None else channels)
         dtype = dtype or (torch.float64 if self.fidelity.double else torch.float32)
-        if field is not None and isinstance(self.measured, FieldBank):
-            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device, checked_places(field))
+        if self.measured is not None and (field is None or isinstance(self.measured, FieldBank)):
+            places = None if field is None else checked_places(field)
+            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device, places)
             return bank if defocus is None else bank.at_defocus(defocus)
+        nodes = self.defocus_nodes if defocus is None else defocus
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
-            nodes = self.defocus_nodes if defocus is None else defocus
             self._warn_if_beyond(points, nodes)
             given = self._of_lens(spectrum.flat(), nodes, self.window, points, tolerance)
             return field_psf_bank(*self.states(dtype), **given).with_stray_light(self.fidelity.stray_light)
-        if self.measured is not None:
-            bank = self._measured_bank(spectrum, dtype, self.masks.phase.device)
-            return bank if defocus is None else bank.at_defocus(defocus)
-        nodes = self.defocus_nodes if defocus is None else defocus
         bank = self._computed_bank(spectrum.flat(), dtype, nodes)
         own = PSFBank(*(x.clone() for x in (bank.psfs, bank.defocus, bank.energy)))  # users may change these
         return own.with_stray_light(self.fidelity.stray_light)

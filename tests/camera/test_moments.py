@@ -12,7 +12,7 @@ from torch import nn
 import kornia_tidy.optics  # noqa: F401 (all modulators are defined)
 from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, Switching, TiDyOptics, burst
 from kornia_tidy.augmentation.drawn_camera import PhaseJitter
-from kornia_tidy.camera.motion import moment_times, moving_capture, state_times
+from kornia_tidy.camera.motion import moment_times, moving_capture
 from kornia_tidy.modulator import GreyLevels, PixelCrosstalk, StrokeError
 from kornia_tidy.modulator.modulator import DiffractionEfficiency, Modulator, SpatialLightModulator, timeline_of
 from kornia_tidy.optics import SYSTEMS
@@ -152,7 +152,7 @@ class TestDiffractionInTime(BaseTester):
     def test_feature_one_mask_is_one_moment(self):
         optics = TiDyOptics.from_preset("ikoma2021")
         assert moment_times(optics).tolist() == [0.5]
-        assert state_times(optics).tolist() == [0.5, 0.5]
+        assert optics.timeline(torch.float32).state_times().tolist() == [0.5, 0.5]
 
     def test_feature_the_first_of_two_shots_holds_undiffracted_light_of_half_the_time(self):
         optics, (image, depth) = camera(DiffractionEfficiency(EFFICIENCY), masks=2), scene()

@@ -9,7 +9,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from kornia_tidy import DwellTimes, Fidelity, LearnableDwellTimes, PixelwiseMask, SensorNoise, Switching, TiDyOptics
-from kornia_tidy.camera.motion import moving_capture, scenes_by_flow, scenes_by_homography, state_times
+from kornia_tidy.camera.motion import moving_capture, scenes_by_flow, scenes_by_homography
 from kornia_tidy.masks import metres_to_radians
 from kornia_tidy.modulator import GreyLevels, SpatialLightModulator
 from kornia_tidy.psf import PSFModel
@@ -158,14 +158,15 @@ class TestThroughState(BaseTester):
 
 class TestStateTimes(BaseTester):
     def test_feature_dwell_times_follow_one_another(self):
-        self.assert_close(state_times(camera(modulator=DwellTimes((1, 2, 1)))), torch.tensor([0.125, 0.5, 0.875]))
+        times = camera(modulator=DwellTimes((1, 2, 1))).timeline(torch.float32).state_times()
+        self.assert_close(times, torch.tensor([0.125, 0.5, 0.875]))
 
     @pytest.mark.parametrize("cyclic", [False, True])
     def test_feature_states_between_masks_stand_between_them(self, cyclic):
         """Masks at the middles of what swaps leave, and between two of them as many in order as there are samples."""
         switching = Switching(10e-3, 0.1, "linear", cyclic=cyclic, samples=2)
         optics = camera(modulator=SpatialLightModulator(GreyLevels(8), switching))
-        times, weights = state_times(optics), optics.state_weights(torch.float32)
+        times, weights = optics.timeline(torch.float32).state_times(), optics.state_weights(torch.float32)
         order = times.argsort()
         names = order.tolist()
         swaps = 3 if cyclic else 2
@@ -176,9 +177,9 @@ class TestStateTimes(BaseTester):
         self.assert_close(times[:3], torch.tensor([(k + 0.5) * stand + 0.1 * k for k in range(3)]))
 
     def test_feature_random_states_stand_in_the_middle_of_their_swap(self):
-        times = state_times(camera(modulator=Switching(10e-3, 0.1)))
+        times = camera(modulator=Switching(10e-3, 0.1)).timeline(torch.float32).state_times()
         self.assert_close(times, torch.tensor([2 / 15, 0.5, 13 / 15, 0.8 / 3 + 0.05, 1.6 / 3 + 0.15]))
-        assert state_times(camera(modulator=Switching(0.0))).shape == (3,)
+        assert camera(modulator=Switching(0.0)).timeline(torch.float32).state_times().shape == (3,)
 
 
 class TestScenes(BaseTester):
