@@ -23,7 +23,7 @@ from kornia_tidy.reconstruction.self_ensemble import ORIENTATIONS
 from kornia_tidy.reconstruction.tasks import MAPS
 from kornia_tidy.render import borders, compositing
 from kornia_tidy.settings import settings_of
-from kornia_tidy.training import data_sets, noisy_crops, settings, task_loss
+from kornia_tidy.training import data_sets, settings, task_loss
 from kornia_tidy.training.coded_datasets import layout
 from tests.base import BaseTester
 
@@ -61,7 +61,6 @@ class TestChoices(BaseTester):
         assert tuple(settings.DATA) == tuple(data_sets.SCENES)
         assert tuple(settings.LOSS) == tuple(task_loss.LOSSES)
         assert settings.SSIM_WINDOW == metrics.SSIM_WINDOW
-        assert settings.TrainingSettings().noise_error == noisy_crops.TOLD_ERROR
         assert {one.name: one for one in settings_of(settings.TrainingSettings)}["fidelity"].unit.choices == tuple(
             PRESETS
         )
