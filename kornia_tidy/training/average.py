@@ -52,7 +52,6 @@ class MovingAverage(nn.Module):
         self.network = copy.deepcopy(network).requires_grad_(requires_grad=False)
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
-    @torch.no_grad()
     def update(self, network: nn.Module) -> None:
         """Move the average towards the network's present weights by one step."""
         steps = int(self.steps)

@@ -14,7 +14,13 @@ from kornia_tidy.psf.psf_bank import PSFBank
 
 
 def progress_bar(what: str, **options: Any) -> tqdm:
-    """Return a bar of progress on standard error, which vanishes at the end; none where that is not a terminal."""
+    """Return a bar of progress on standard error, which vanishes at the end; none where that is not a terminal.
+
+    Example:
+        >>> bar = progress_bar("render", total=2)
+        >>> bar.disable, bar.leave  # an example has no terminal
+        (True, False)
+    """
     return tqdm(desc=what, file=sys.stderr, leave=False, **{"disable": None, **options})
 
 

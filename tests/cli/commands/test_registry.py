@@ -96,6 +96,7 @@ class TestRegistry(BaseTester):
             for setting, *_ in _entries(command):
                 meanings[setting.name].add((setting.unit.symbol, setting.unit.name, setting.kind, setting.items))
         assert {name for name, kinds in meanings.items() if len(kinds) > 1} == OTHER_MEANINGS
+        assert [words for words, command in ALL.items() if getattr(command, "seed", 0)] == [("demo",)]
 
     @every_command
     def test_exception_a_value_that_is_none_is_refused_by_name(self, words, capsys):
