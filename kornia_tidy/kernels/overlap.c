@@ -24,7 +24,7 @@
 #include "vectors.h"
 #include "field.h"
 
-enum { STAGES = 16 };        // of a transform of up to 2^31 samples by fours
+enum { STAGES = 20 };        // of a transform of up to 3^20 samples: no stage has fewer than three
 enum { OUTSIDE = -2 };       // label of a sample that is no pixel of the tile: no layer, nor the one before the first
 
 typedef struct {
@@ -65,20 +65,30 @@ INLINE wave turned(wave x, REAL re, REAL im) { return (wave){x.re * re - x.im * 
 INLINE wave sum(wave a, wave b) { return (wave){a.re + b.re, a.im + b.im}; }
 INLINE wave difference(wave a, wave b) { return (wave){a.re - b.re, a.im - b.im}; }
 
-// The transform of a few samples; `sign` is that of the exponent.
+// The transform of four samples; `sign` is that of the exponent.
+INLINE void four(wave *x, const REAL sign) {
+    wave a = sum(x[0], x[2]), b = difference(x[0], x[2]), c = sum(x[1], x[3]);
+    wave e = difference(x[1], x[3]);
+    wave d = sign > 0 ? (wave){-e.im, e.re} : (wave){e.im, -e.re};
+    x[0] = sum(a, c);
+    x[1] = sum(b, d);
+    x[2] = difference(a, c);
+    x[3] = difference(b, d);
+}
+
+// The transform of 3, 4, 5 or 8 samples.
 INLINE void few(wave *x, int radix, const REAL sign) {
-    if (radix == 2) {
-        wave a = x[0];
-        x[0] = sum(a, x[1]);
-        x[1] = difference(a, x[1]);
-    } else if (radix == 4) {
-        wave a = sum(x[0], x[2]), b = difference(x[0], x[2]), c = sum(x[1], x[3]);
-        wave e = difference(x[1], x[3]);
-        wave d = sign > 0 ? (wave){-e.im, e.re} : (wave){e.im, -e.re};
-        x[0] = sum(a, c);
-        x[1] = sum(b, d);
-        x[2] = difference(a, c);
-        x[3] = difference(b, d);
+    if (radix == 4) {
+        four(x, sign);
+    } else if (radix == 8) {
+        const REAL c = (REAL)0.70710678118654752440;
+        wave e[4] = {x[0], x[2], x[4], x[6]}, o[4] = {x[1], x[3], x[5], x[7]};
+        four(e, sign), four(o, sign);
+        o[1] = (wave){c * (o[1].re - sign * o[1].im), c * (o[1].im + sign * o[1].re)};
+        o[2] = sign > 0 ? (wave){-o[2].im, o[2].re} : (wave){o[2].im, -o[2].re};
+        o[3] = (wave){-c * (o[3].re + sign * o[3].im), c * (sign * o[3].re - o[3].im)};
+#pragma GCC unroll 4
+        for (int q = 0; q < 4; q++) x[q] = sum(e[q], o[q]), x[q + 4] = difference(e[q], o[q]);
     } else if (radix == 3) {
         const REAL s = sign * (REAL)0.86602540378443864676;
         wave a = sum(x[1], x[2]), e = difference(x[1], x[2]);
@@ -103,72 +113,57 @@ INLINE void few(wave *x, int radix, const REAL sign) {
     }
 }
 
-INLINE void forward_stage(wave *x, int64_t n, const stage *s, int radix) {
-    int64_t step = s->length / radix;
-    for (int64_t j = 0; j < step; j++) {
-        const REAL *turn = s->turns + 2 * j * (radix - 1);
-        for (int64_t b = j; b < n; b += s->length) {
-            wave y[5];
-#pragma GCC unroll 5
-            for (int q = 0; q < radix; q++) y[q] = x[b + q * step];
-            few(y, radix, -1);
-            x[b] = y[0];
-#pragma GCC unroll 5
-            for (int q = 1; q < radix; q++) x[b + q * step] = turned(y[q], turn[2 * q - 2], turn[2 * q - 1]);
+// One place in each sequence of a stage: turns the samples after the forward transform, before the backward one. Without
+// `turn` its factors are one.
+INLINE void butterflies(wave *x, int64_t n, const stage *s, int radix, const REAL sign, int64_t j, const REAL *turn) {
+    const int64_t step = s->length / radix;
+    for (int64_t b = j; b < n; b += s->length) {
+        wave y[8];
+#pragma GCC unroll 8
+        for (int q = 0; q < radix; q++) {
+            y[q] = x[b + q * step];
+            if (sign > 0 && turn && q) y[q] = turned(y[q], turn[2 * q - 2], -turn[2 * q - 1]);
         }
+        few(y, radix, sign);
+#pragma GCC unroll 8
+        for (int q = 0; q < radix; q++)
+            x[b + q * step] = sign < 0 && turn && q ? turned(y[q], turn[2 * q - 2], turn[2 * q - 1]) : y[q];
     }
 }
 
-INLINE void backward_stage(wave *x, int64_t n, const stage *s, int radix) {
-    int64_t step = s->length / radix;
-    for (int64_t j = 0; j < step; j++) {
-        const REAL *turn = s->turns + 2 * j * (radix - 1);
-        for (int64_t b = j; b < n; b += s->length) {
-            wave y[5];
-            y[0] = x[b];
-#pragma GCC unroll 5
-            for (int q = 1; q < radix; q++) y[q] = turned(x[b + q * step], turn[2 * q - 2], -turn[2 * q - 1]);
-            few(y, radix, 1);
-#pragma GCC unroll 5
-            for (int q = 0; q < radix; q++) x[b + q * step] = y[q];
-        }
-    }
+INLINE void run_stage(wave *x, int64_t n, const stage *s, int radix, const REAL sign) {
+    butterflies(x, n, s, radix, sign, 0, 0);
+    for (int64_t j = 1; j < s->length / radix; j++) butterflies(x, n, s, radix, sign, j, s->turns + 2 * j * (radix - 1));
 }
 
-static void forward(wave *x, const transform *t) {
+INLINE void transformed(wave *x, const transform *t, const REAL sign) {
     for (int i = 0; i < t->count; i++) {
-        const stage *s = t->stages + i;
-        if (s->radix == 4) forward_stage(x, t->length, s, 4);
-        else if (s->radix == 3) forward_stage(x, t->length, s, 3);
-        else if (s->radix == 2) forward_stage(x, t->length, s, 2);
-        else forward_stage(x, t->length, s, 5);
+        const stage *s = t->stages + (sign < 0 ? i : t->count - 1 - i);
+        if (s->radix == 4) run_stage(x, t->length, s, 4, sign);
+        else if (s->radix == 8) run_stage(x, t->length, s, 8, sign);
+        else if (s->radix == 3) run_stage(x, t->length, s, 3, sign);
+        else run_stage(x, t->length, s, 5, sign);
     }
 }
 
-static void backward(wave *x, const transform *t) {
-    for (int i = t->count - 1; i >= 0; i--) {
-        const stage *s = t->stages + i;
-        if (s->radix == 4) backward_stage(x, t->length, s, 4);
-        else if (s->radix == 3) backward_stage(x, t->length, s, 3);
-        else if (s->radix == 2) backward_stage(x, t->length, s, 2);
-        else backward_stage(x, t->length, s, 5);
-    }
-}
+static void forward(wave *x, const transform *t) { transformed(x, t, -1); }
+static void backward(wave *x, const transform *t) { transformed(x, t, 1); }
 
 // Lists the stages of a transform in `memory`, which has room for 2 * length complex numbers, and returns the rest of it.
+// The length has at least three factors of two, by eights and fours.
 static REAL *plan(transform *t, int64_t length, REAL *memory) {
-    const int radices[] = {4, 3, 5, 2};
     *t = (transform){.length = length};
-    for (int k = 0; k < 4; k++)
-        for (int radix = radices[k]; length % radix == 0; length /= radix) {
-            t->stages[t->count++] = (stage){radix, length, memory};
-            for (int64_t j = 0; j < length / radix; j++)
-                for (int q = 1; q < radix; q++, memory += 2) {
-                    double angle = -2 * M_PI * (double)(j * q) / (double)length;
-                    memory[0] = cos(angle);
-                    memory[1] = sin(angle);
-                }
-        }
+    for (int radix; length > 1; length /= radix) {
+        const int twos = __builtin_ctzll(length);
+        radix = twos == 3 || twos > 4 ? 8 : twos ? 4 : length % 3 ? 5 : 3;
+        t->stages[t->count++] = (stage){radix, length, memory};
+        for (int64_t j = 0; j < length / radix; j++)
+            for (int q = 1; q < radix; q++, memory += 2) {
+                double angle = -2 * M_PI * (double)(j * q) / (double)length;
+                memory[0] = cos(angle);
+                memory[1] = sin(angle);
+            }
+    }
     return memory;
 }
 
@@ -326,6 +321,8 @@ static void row_back(const work *w, wave *row, int64_t band, const uint8_t *need
         if (!needed || needed[g]) transpose(row + g * LANES, half + g * w->s->rows + band * LANES);
 }
 
+enum { ROWS_AHEAD = 8 };  // rows of a tile that are asked for before they are read: each lies far from the one before
+
 // Copies numbers into a black window, from a row and a column of it on.
 static void cut(const work *w, const REAL *from, int64_t pitch, int64_t height, int64_t width, int64_t origin, vec *to) {
     const int64_t rows = w->s->rows;
@@ -334,6 +331,7 @@ static void cut(const work *w, const REAL *from, int64_t pitch, int64_t height, 
         for (int64_t x = 0, column = origin; x < width;) {
             const int64_t lane = column % LANES, count = least(LANES - lane, width - x);
             REAL *target = (REAL *)(to + column / LANES * rows + origin + y) + lane;
+            __builtin_prefetch(from + (y + ROWS_AHEAD) * pitch + x);
             if (count == LANES) memcpy(target, from + y * pitch + x, sizeof(vec));
             else memcpy(target, from + y * pitch + x, count * sizeof(REAL));
             x += count, column += count;
@@ -362,6 +360,8 @@ static void read_labels(const work *w, tile t, desk *d) {
         for (int64_t x = 0, column = s->origin; x < t.width;) {
             const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
             REAL *target = (REAL *)(d->label + column / LANES * s->rows + s->origin + y) + lane;
+            const int64_t *ahead = index + (y + ROWS_AHEAD) * s->index_row + x;
+            __builtin_prefetch(ahead), __builtin_prefetch(ahead + 8);
             for (int64_t i = 0; i < count; i++) target[i] = index[y * s->index_row + x + i];
             x += count, column += count;
         }
@@ -657,17 +657,19 @@ static int note_layers(const work *w) {
     for (int64_t n = 0; n < s->images * w->tiles; n++) {
         const tile t = tile_at(w, n / w->tiles, n % w->tiles);
         uint8_t *needed = needed_by(w, t, 0);
-        int64_t group = 0;
+        int64_t group = 0, last = -1;
         for (int64_t y = t.top; y < t.top + t.height; y++) {
             const int64_t *index = s->index + t.image * s->index_image + y * s->index_row + t.left;
             const REAL *weight = s->weight ? s->weight + t.image * s->weight_image + y * s->weight_row + t.left : 0;
             for (int64_t x = 0, column = s->origin; x < t.width; x++, column++) {
                 const int next = weight && (s->weight_gradient || !(weight[x] <= 0));
-                if (column % LANES == 0 || x == 0) group = column / LANES % w->groups;
+                if (column % LANES == 0 || x == 0) group = column / LANES % w->groups, last = -1;
                 if ((uint64_t)index[x] >= (uint64_t)(s->layers - next)) {
                     bad = 1;
                     continue;
                 }
+                if (2 * index[x] + next == last) continue;  // as many neighbours
+                last = 2 * index[x] + next;
                 needed[index[x] * w->groups + group] = 1;
                 if (next) needed[(index[x] + 1) * w->groups + group] = 1;
             }
