@@ -9,7 +9,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from kornia_tidy.render.borders import next_fast_size
+from kornia_tidy.render.borders import transform_side
 from kornia_tidy.render.scene import LayeredScene
 
 GradientPairs = list[tuple[Tensor, Tensor]]  # a tensor and its gradient
@@ -58,7 +58,7 @@ def transform_operations(height: int, width: int) -> float:
         >>> transform_operations(64, 64) / 64**2
         30.0
     """
-    samples = next_fast_size(height) * next_fast_size(width)
+    samples = transform_side(height) * transform_side(width)
     return 2.5 * samples * math.log2(samples)
 
 

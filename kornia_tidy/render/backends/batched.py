@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.precision import widest
-from kornia_tidy.kernels.window_sides import next_fast_size
 from kornia_tidy.render.backend import GradientPairs, Work, transform_operations
 from kornia_tidy.render.backends.allocator import keep_memory
 from kornia_tidy.render.backends.dense import dense_work
@@ -22,6 +21,7 @@ from kornia_tidy.render.backends.dense_occlusion import occlusion_planes
 from kornia_tidy.render.backends.layer_batches import LayerBatches, Part
 from kornia_tidy.render.backends.layer_sums import blend_gradients, present_in_tiles, seen
 from kornia_tidy.render.backends.occlusion_batches import occlude_parts, part_gradients
+from kornia_tidy.render.borders import transform_side
 from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
@@ -78,7 +78,7 @@ class BatchedBackend:
             held = present_in_tiles(labels.every(SAMPLE), (height, width), every, reach, SAMPLE)
             pairs, layers, most = (int(number) for number in (held.sum(), held.any(0).sum(), held.sum(1).max()))
         image = channels * labels.layer_index.numel() * scene.image.element_size()
-        sides = next_fast_size(height + lost), next_fast_size(width + lost)
+        sides = transform_side(height + lost), transform_side(width + lost)
         samples, transform = sides[0] * sides[1], transform_operations(*sides)
         plane = channels * self._plane_bytes(scene, sides)
         if occludes:  # in float64, where operations take twice as long
@@ -100,7 +100,7 @@ class BatchedBackend:
             return size
         if scene.image.device.type == "cpu":
             windows = count(max(self.smallest, -(-5 * side // (2 * _STEP)) * _STEP), _STEP)
-            most = next(window for window in windows if next_fast_size(window) == window) - side + 1
+            most = next(window for window in windows if transform_side(window) == window) - side + 1
         else:
             planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
             most = max(size)
@@ -121,7 +121,7 @@ class BatchedBackend:
             for own, whole in ((height, size[0]), (width, size[1]))
         )
         lost = scene.psfs.shape[-1] - 1
-        one = self._plane_bytes(scene, (next_fast_size(height + lost), next_fast_size(width + lost)))
+        one = self._plane_bytes(scene, (transform_side(height + lost), transform_side(width + lost)))
         here, occludes, most = (
             scene.image.device.type == "cpu",
             scene.compositing == "occlusion",

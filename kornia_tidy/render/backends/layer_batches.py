@@ -55,7 +55,9 @@ class Part:
 
 
 class LayerBatches:
-    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`. Spectra of the PSFs are computed once.
+    """See :class:`kornia_tidy.render.backends.layer_sums.LayerSums`.
+
+    All parts are transformed as windows of one size, so that spectra of the PSFs are computed once.
 
     Args:
         scene: to be rendered.
@@ -67,7 +69,11 @@ class LayerBatches:
         self.rim = 0 if scene.compositing == "scatter" and len(parts) == 1 else self.side - 1  # it would be cut
         self.index, weight = scene.sorted_layers
         self.weight = None if weight is None else weight.detach()
-        self.spectra: dict[tuple[int, int, bool], Tensor] = {}
+        self.tile = [
+            max(own.stop - own.start for own in axis)
+            for axis in zip(*((p.rows, p.columns) for p in parts), strict=True)
+        ]
+        self.spectra: dict[tuple[tuple[int, int], bool], Tensor] = {}
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         """Return the gathered light (B, C, h, w) of a plane."""
@@ -81,7 +87,8 @@ class LayerBatches:
 
     def _gathered(self, plane: Tensor, part: Part, correlate: bool, weight_gradient: bool) -> Tensor:
         light, (index, weight) = part.window(plane[:, part.channels], self.side - 1), self._labels(part)
-        psfs, size = self._psfs(part, light, correlate), (light.shape[-2], light.shape[-1])
+        size = self._size(self.side - 1)
+        psfs = self._psfs(part, size, correlate)
         blurred = from_spectrum(to_spectrum(light, size)[:, None] * psfs, size, self.side)
         places = index[:, None, None].expand(len(blurred), 1, light.shape[1], -1, -1)
         below = blurred.gather(1, places)[:, 0]
@@ -94,40 +101,40 @@ class LayerBatches:
         """Return the light that pixels scatter."""
         whole: Tensor | None = None
         for part in self.parts:
-            light = part.window(pixels[:, part.channels])
-            size = light.shape[-2] + self.rim, light.shape[-1] + self.rim
-            spectra = to_spectrum(self._own(light, part), size) * self._psfs(part, light, correlate, size)
+            light, size = part.window(pixels[:, part.channels]), self._size(self.rim)
+            spectra = to_spectrum(self._own(light, part), size) * self._psfs(part, size, correlate)
             spread = from_spectrum(spectra.sum(1), size, 1)
             if len(self.parts) == 1:
                 return spread
             if whole is None:
                 whole = pixels.new_zeros(*pixels.shape[:2], *(side + self.rim for side in pixels.shape[-2:]))
-            part.window(whole[:, part.channels], self.rim).add_(spread)
+            target = part.window(whole[:, part.channels], self.rim)
+            target.add_(spread[..., : target.shape[-2], : target.shape[-1]])
         assert whole is not None
         return whole
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return the gradient of the PSFs, (D, C, P, P)."""
-        found: dict[tuple[int, int], Tensor] = {}
+        size, found = self._size(self.side - 1), None
         for part in self.parts:
-            light = part.window(plane[:, part.channels], self.side - 1)
-            size = light.shape[-2], light.shape[-1]
+            light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size)
             own = to_spectrum(self._own(part.window(pixels[:, part.channels]), part), size)
-            product = (own.conj() * to_spectrum(light, size)[:, None]).sum(0)
+            product = (own.conj() * light[:, None]).sum(0)
             if part.layers is None and part.channels == slice(0, pixels.shape[1]):
-                found[size] = found[size] + product if size in found else product
+                found = product if found is None else found + product
                 continue
-            if size not in found:
-                found[size] = product.new_zeros(*self.psfs.shape[:2], *product.shape[-2:])
-            layers = slice(None) if part.layers is None else part.layers
-            found[size][layers, part.channels] += product
-        psfs = [from_spectrum(total, size, 1)[..., : self.side, : self.side] for size, total in found.items()]
-        total = sum(psfs[1:], psfs[0])
+            if found is None:
+                found = product.new_zeros(*self.psfs.shape[:2], *product.shape[-2:])
+            found[slice(None) if part.layers is None else part.layers, part.channels] += product
+        assert found is not None
+        total = from_spectrum(found, size, 1)[..., : self.side, : self.side]
         return total if correlate else total.flip((-2, -1))
 
-    def _psfs(self, part: Part, light: Tensor, correlate: bool, size: tuple[int, int] | None = None) -> Tensor:
-        size = size or (light.shape[-2], light.shape[-1])
-        if (key := (*size, correlate)) not in self.spectra:
+    def _size(self, more: int) -> tuple[int, int]:
+        return self.tile[0] + more, self.tile[1] + more
+
+    def _psfs(self, part: Part, size: tuple[int, int], correlate: bool) -> Tensor:
+        if (key := (size, correlate)) not in self.spectra:
             self.spectra[key] = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
         return part.chosen(self.spectra[key])[:, part.channels]
 
