@@ -23,6 +23,7 @@ MOVED = {
     "inference.capture_file": "lab.capture_file",
     "inference.compared_cameras": "design.compared_cameras",
     "inference.measured": "lab.measured",
+    "lab.raw.dng_file": "lab.raw.dng_writer",
     "mask_design": "design",
     "mask_export": "lab.mask_export",
     "planning": "accuracy",

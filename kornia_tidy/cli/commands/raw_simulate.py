@@ -123,7 +123,7 @@ class SimulateRaw:
         import torch
 
         from kornia_tidy.cli.commands.report import tell
-        from kornia_tidy.lab.raw.dng_file import write_dng
+        from kornia_tidy.lab.raw.dng_writer import write_dng
         from kornia_tidy.lab.raw.simulation import simulate_raw
 
         generator = torch.Generator().manual_seed(self.sensor.seed)

@@ -2,7 +2,7 @@
 
 A raw file, DNG among them, comes in; ``decoder.py`` reads it, and a capture with its levels and filter array goes out
 (``capture.py``, read it first), which ``develop.py`` turns into a picture. ``simulation.py`` goes the other way, and
-``dng_file.py`` writes DNGs.
+``dng_writer.py`` writes DNGs.
 """
 
 from kornia_tidy.lab.raw.capture import RawCapture, RawInfo

@@ -19,7 +19,7 @@ from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.cli import main
 from kornia_tidy.data import dead_leaves, write_depth, write_image
 from kornia_tidy.lab.mask_export import write_heights
-from kornia_tidy.lab.raw.dng_file import write_dng
+from kornia_tidy.lab.raw.dng_writer import write_dng
 from kornia_tidy.lab.raw.simulation import simulate_raw, simulated_sensor
 from kornia_tidy.settings import documented, section
 from kornia_tidy.training.coded_datasets import render_scenes

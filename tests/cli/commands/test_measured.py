@@ -14,7 +14,7 @@ from kornia_tidy.lab.calibration.psf import MeasuredPSFs, measured_camera
 from kornia_tidy.lab.measured import closed_form_system
 from kornia_tidy.lab.raw import RawCapture, RawInfo, develop, simulate_scene
 from kornia_tidy.lab.raw.developed_noise import developed_noise
-from kornia_tidy.lab.raw.dng_file import write_dng
+from kornia_tidy.lab.raw.dng_writer import write_dng
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.trained import load_trained

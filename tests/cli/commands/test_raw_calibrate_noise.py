@@ -6,7 +6,7 @@ import pytest
 from kornia_tidy.cli import main
 from kornia_tidy.lab.calibration.noise.photon_transfer import read_json
 from kornia_tidy.lab.raw import RawInfo
-from kornia_tidy.lab.raw.dng_file import write_dng
+from kornia_tidy.lab.raw.dng_writer import write_dng
 from tests.base import BaseTester
 from tests.lab.calibration.noise.flats import flats
 

@@ -16,7 +16,7 @@ from kornia_tidy.data import read_depth, read_image
 from kornia_tidy.figures import style
 from kornia_tidy.lab import capture_file
 from kornia_tidy.lab.raw import RawCapture, develop, simulate_raw
-from kornia_tidy.lab.raw.dng_file import encode_dng
+from kornia_tidy.lab.raw.dng_writer import encode_dng
 from kornia_tidy.lab.raw.tags import NOISE_PROFILE
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained

@@ -9,8 +9,8 @@ import tifffile
 import torch
 
 from kornia_tidy.lab.raw import RawCapture, develop
-from kornia_tidy.lab.raw.dng_file import encode_dng
 from kornia_tidy.lab.raw.dng_sensor import dng_sensor, ignored_opcodes, missing_bytes
+from kornia_tidy.lab.raw.dng_writer import encode_dng
 from kornia_tidy.lab.raw.tags import tiff_directories
 from tests.base import BaseTester, shared
 from tests.lab.raw.dng import BYTE, LONG, RATIONAL, SHORT, UNDEFINED, XTRANS, dng, patched

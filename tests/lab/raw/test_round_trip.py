@@ -12,7 +12,7 @@ from kornia.color import linear_rgb_to_rgb
 from kornia_tidy import SensorNoise
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.lab.raw import RawCapture, develop, simulate_scene
-from kornia_tidy.lab.raw.dng_file import encode_dng
+from kornia_tidy.lab.raw.dng_writer import encode_dng
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.pretrained import load_pretrained

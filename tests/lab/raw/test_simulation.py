@@ -12,7 +12,7 @@ import torch
 from kornia_tidy import PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.lab.raw import RawCapture
-from kornia_tidy.lab.raw.dng_file import encode_dng
+from kornia_tidy.lab.raw.dng_writer import encode_dng
 from kornia_tidy.lab.raw.simulation import sensor_counts, simulate_raw, simulate_scene
 from tests.base import BaseTester
 

@@ -13,7 +13,7 @@ import rawpy
 import torch
 
 from kornia_tidy.lab.raw import RawCapture, RawInfo
-from kornia_tidy.lab.raw.dng_file import encode_dng, write_dng
+from kornia_tidy.lab.raw.dng_writer import encode_dng, write_dng
 from kornia_tidy.lab.raw.filter_array import indexed_tile
 from tests.base import BaseTester
 from tests.lab.raw.dng import XTRANS
