@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from kornia_tidy import Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
+from kornia_tidy import DefocusRange, Fidelity, PixelwiseMask, SensorNoise, TiDyOptics
 from kornia_tidy.psf.pupil import pupil_field
 from kornia_tidy.render import gather
 from tests.base import BaseTester
@@ -35,9 +35,9 @@ def fidelity_of(name: str, **settings: Any) -> Fidelity:
 
 
 def train(optics: TiDyOptics, image: torch.Tensor, depth: torch.Tensor) -> list[torch.Tensor]:
-    """Return a capture, and the gradients of all parameters."""
+    """Return a capture, and the gradients of all parameters and of a depth that is learnt."""
     coded = optics(image, depth)
-    parameters = [x for x in optics.parameters() if x.requires_grad]
+    parameters = [x for x in (*optics.parameters(), depth) if x.requires_grad]
     return [coded, *(torch.autograd.grad(coded.square().mean(), parameters) if parameters else ())]
 
 
@@ -85,6 +85,10 @@ class TestCaptures(AcceleratorTester):
         self.assert_close(fixed(image, depth), expected, rtol=0, atol=ROUNDING)
         self.assert_agrees(fixed, image, depth)
         self.assert_agrees(optics.with_fixed_layers(depth), image, depth)
+
+    def test_gradcheck_depth_on_a_node_between_layers(self):
+        optics = TiDyOptics(camera=DefocusRange(-20, 20), fidelity=fidelity_of("balanced"), sensor=None)
+        self.assert_agrees(optics, scene(1, 24)[0], torch.full((1, 1, 24, 24), 0.5, requires_grad=True))
 
     def test_feature_noise_is_drawn_on_the_device(self):
         optics = TiDyOptics(fidelity=fidelity_of("balanced"), sensor=SensorNoise(0.01))
@@ -167,7 +171,7 @@ class TestChecks(BaseTester):
 
     def test_feature_pixels_beyond_the_range_are_counted_and_told_once(self):
         image, depth = scene(1, 24)
-        depth[..., :2, :3] = 0.2
+        depth[..., :2, :3], depth[..., 2, :3] = 0.2, float("inf")
         with SimulatedDevice() as device:
             optics = device.put(TiDyOptics(fidelity=fidelity_of("draft")))
             with pytest.warns(UserWarning, match="6 of 576 pixels have a defocus between"):

@@ -46,8 +46,8 @@ def fitted_window(psfs: Callable[[int], Tensor], fidelity: Fidelity, fixed: int 
 
     Example:
         >>> import torch
-        >>> fitted_window(lambda side: torch.ones(1, 1, side, side) / 128, Fidelity(enclosed_energy=0.6, max_window=9))
-        FittedWindow(side=9, held=(0.6328125, 0.6328125), enough=True)
+        >>> fitted_window(lambda side: torch.ones(1, 1, side, side) / 128, Fidelity(enclosed_energy=0.2, max_window=9))
+        FittedWindow(side=7, held=(0.3828125, 0.3828125), enough=True)
     """
     size = fixed or min(33, fidelity.max_window)
     while True:

@@ -211,6 +211,8 @@ class SensorNoise(Sensor):
         >>> sensor = SensorNoise.physical(full_well=10500, read_noise_electrons=2.4)
         >>> sensor(torch.full((1, 3, 4, 4), 0.5)).shape
         torch.Size([1, 3, 4, 4])
+        >>> SensorNoise().sigma
+        0.01
         >>> SensorNoise(0.0)(torch.tensor([-0.5, 0.5, 1.5]).view(1, 1, 1, 3)).flatten()
         tensor([0.0000, 0.5000, 1.0000])
     """

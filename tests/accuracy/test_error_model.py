@@ -51,6 +51,11 @@ class TestPower(BaseTester):
         response = torch.fft.rfft2(kernel, s=(31, 31)).abs().square()
         assert 0.9 < float((power_spectrum(light, border, 31) * response).sum()) / measured < 1.6
 
+    def test_feature_a_veil_is_dark_where_it_comes_from_beyond_a_zero_border(self):
+        dark = 1 - scipy.ndimage.uniform_filter(torch.ones(30, 30).double().numpy(), 15, mode="constant")
+        power = power_spectrum(torch.ones(1, 1, 30, 30), "zero", 31)
+        assert float(power[0, 0, 0]) == pytest.approx((dark**2).mean())
+
     def test_feature_large_images_are_read_in_blocks(self, monkeypatch):
         light = torch.rand(1, 1, 64, 48, dtype=torch.float64)
         whole = power_spectrum(light, "reflect", 7)

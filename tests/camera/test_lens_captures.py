@@ -244,6 +244,10 @@ class TestLensCaptures(BaseTester):
         assert "places over the picture" in str(plan)
 
     @torch.no_grad()
+    def test_feature_a_plan_is_predicted_to_keep_the_tolerance(self):
+        assert camera().plan(scene(24, 24)[1], tolerance=1e-3).predicted_error <= 1e-3
+
+    @torch.no_grad()
     def test_feature_pictures_of_other_sizes_are_remembered_and_do_not_travel(self):
         optics = camera(center=(450.0, 520.0))
         sizes = [(24, 24), (24, 30), (30, 24), (24, 24)]

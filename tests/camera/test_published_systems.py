@@ -10,6 +10,7 @@ import torch
 
 from kornia_tidy import DefocusRange, NoMask, PixelwiseMask, TiDyOptics
 from kornia_tidy.camera.published_systems import single_element
+from kornia_tidy.design.fisher_information import defocus_bound, defocus_response, fisher_information
 from kornia_tidy.optics import SYSTEMS, published_system
 from kornia_tidy.psf import AliasingWarning
 from tests.base import BaseTester
@@ -74,6 +75,11 @@ class TestSources(BaseTester):
         assert 1.19e-6 < float(heights.max()) <= 1.2e-6
         modes = {name: preset(name).masks.coefficients.shape[1] for name in ("phasecam3d", "sitzmann2018")}
         assert modes == {"phasecam3d": 55, "sitzmann2018": 350}
+
+    def test_feature_a_designed_mask_has_the_bound_that_is_told(self):
+        response = defocus_response(preset("phasecam3d").psf_model, [float(psi) for psi in range(-10, 11, 2)])
+        bound = defocus_bound(fisher_information(response, photons=3000, background=5)).mean().detach()
+        assert float(bound) == pytest.approx(0.0353, rel=5e-3)
 
     def test_convention_a_guess_says_so_first(self):
         for system in SYSTEMS.values():

@@ -59,6 +59,7 @@ class TestCaptureInBands(BaseTester):
         optics.memory_budget = budget = 2 * len(optics.defocus_nodes) * of_a_layer  # enough for one place
         sample = read_sample(*make_scene(1000, 300), optics)
         assert not comes_in_pieces(optics.psf_model, 3, torch.float32, "gather", budget)
+        assert sample.bytes_at_once > 32 << 20  # of the image's 900,000 values
         rows = next(optics.strips(sample)).rows.stop
         assert rows == rows_at_once(sample, budget // 2) < rows_at_once(sample, budget)
 

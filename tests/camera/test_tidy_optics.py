@@ -124,10 +124,10 @@ class TestWindow(BaseTester):
     @pytest.mark.parametrize("masks", ["flat", "noise"])
     def test_feature_the_window_holds_the_disc_of_the_lens(self, masks):
         """50 mm f/4 at 1 m on pixels of 4 um: a disc of 164 px by rays, which a window of 65 px cut to a fifth."""
-        camera = ThinLensCamera(50e-3, focus_distance=1.0, pixel_pitch=4e-6, f_number=4)
+        camera = ThinLensCamera(50e-3, focus_distance=torch.tensor(1.0), pixel_pitch=4e-6, f_number=4)
         masks = PixelwiseMask(1, initial=masks, generator=torch.Generator().manual_seed(0))
         optics = TiDyOptics(masks, camera, fidelity=Fidelity(layer_spacing=20.0))
-        disc = float(camera.aperture_diameter * camera.image_distance * (1 / 0.5 - 1) / 4e-6)
+        disc = float(camera.aperture_diameter * camera.image_distance.detach() * (1 / 0.5 - 1) / 4e-6)
         assert disc < optics.window < 1.25 * disc
         assert optics.light_held[0] > 0.95
 
