@@ -164,8 +164,8 @@ class PlannedScene:
     def _within(self, tolerance: float) -> Iterator[Fidelity]:
         """Yield the narrowest window within a tolerance for each combination of the other settings."""
         windows, counts = window_steps(self._full), tuple(self._wavelength_counts(tolerance))
-        for layers, double, points, count in product(layer_kinds(), (False, True), PIXEL_TOLERANCES, counts):
-            full = replace(layers, window=windows[-1], double=double, pixel_tolerance=points, wavelengths=count)
+        for layers, points, count in product(layer_kinds(), PIXEL_TOLERANCES, counts):
+            full = replace(layers, window=windows[-1], double=False, pixel_tolerance=points, wavelengths=count)
             if self.error(full) > tolerance:
                 continue
             for stray_light in WINDOW_STRAY_LIGHT:
