@@ -23,7 +23,7 @@ from kornia_tidy.optics.lens.stop_quadrature import StopQuadrature, stop_quadrat
 from kornia_tidy.optics.quadrature import band_limited_quadrature
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.zernike import zernike_polynomials
-from kornia_tidy.psf.psf_cache import PSFMemory, values_of
+from kornia_tidy.psf.psf_cache import PSFMemory
 from kornia_tidy.psf.scattered_transform import scattered_energies, scattered_grid
 
 _FEWEST = 4  # points along a patch, for its amplitude and its edges
@@ -307,21 +307,22 @@ def _mirrored(values: Tensor, mirror: tuple[bool, bool]) -> Tensor:
 def _stop(turned: TurnedLens, spans: Tensor, half: float, tolerance: float) -> Stop:
     """Return the open stop cell by cell, as finely as the phase asks, which changes by so much over half a cell."""
     parts = max(1, math.ceil(half / _LONGEST))
-    given = parts, (half / parts, tolerance), turned.discs(), turned.degree, turned.shift
-    key = (*given[:2], *values_of(given[2], spans), *given[3:])
-    *points, polynomials, moments = _STOPS.recall(key, (0.0,), lambda _: _stop_points(spans.numpy(), *given))
+    discs, cells = (np.array(x.tolist()) for x in (turned.discs(), spans))  # a torch.func tensor has no numpy()
+    given = cells, parts, (half / parts, tolerance), discs, turned.degree, turned.shift
+    key = tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in given)
+    *points, polynomials, moments = _STOPS.recall(key, (0.0,), lambda _: _stop_points(*given))
     return Stop(StopQuadrature(*(part[0] for part in points)), polynomials[0], moments[0])
 
 
 def _stop_points(
-    spans: Array, parts: int, asked: tuple[float, float], discs: Tensor, degree: int, shift: tuple[float, float]
+    spans: Array, parts: int, asked: tuple[float, float], discs: Array, degree: int, shift: tuple[float, float]
 ) -> tuple[Tensor, ...]:
     """Return the parts of a stop with an axis of one before, as they are remembered."""
     begin, end = spans
     steps = np.arange(parts + 1) / parts
     edges = begin[:, None] + (end - begin)[:, None] * steps
     fine = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()])
-    points = stop_quadrature(fine, band_limited_quadrature(*asked, _FEWEST), discs.numpy(), shift)
+    points = stop_quadrature(fine, band_limited_quadrature(*asked, _FEWEST), discs, shift)
     count, smooth = (_count(own) for own in (degree, max(degree, _SMOOTH)))
     polynomials = points.x.new_empty(count, *points.x.shape)
     moments = points.x.new_empty(smooth, len(points.x))
