@@ -240,7 +240,7 @@ def _discs(layer: Tensor, channels: int, max_radius: float) -> tuple[Tensor, Ten
     numbers = range(math.floor(first), math.ceil(last) + 1)
     radii = [disc_radius(number, max_radius) for number in numbers]
     side = 2 * math.ceil(round(max(radii), 4)) + 1
-    made = disc.__wrapped__ if torch.compiler.is_compiling() else disc  # which warns of caches
+    made = _disc if torch.compiler.is_compiling() else disc  # the compiler warns of caches
     psfs = torch.stack([made(radius, side) for radius in radii]).to(layer)
     nodes = layer.new_tensor(list(numbers))
     return nodes, psfs[:, None].expand(-1, channels, -1, -1)
@@ -261,6 +261,11 @@ def disc(radius: float, side: int) -> Tensor:
         >>> disc(0.5, 3)[1, 1], disc(1.5, 3)[1]
         (tensor(1., dtype=torch.float64), tensor([0.1375, 0.1415, 0.1375], dtype=torch.float64))
     """
+    with torch.device("cpu"):  # for any default device
+        return _disc(radius, side)
+
+
+def _disc(radius: float, side: int) -> Tensor:
     area = disc_cover(side, 1.0, max(radius, 0.1))
     return area / area.sum()
 
