@@ -109,9 +109,13 @@ def to_spectrum(planes: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the half spectrum of (..., H, W) planes, filled up with zeros so that planes of ``size`` transform fast.
 
     Image and PSF are both given the padded image's ``size``; the product of their spectra goes to
-    :func:`from_spectrum`.
+    :func:`from_spectrum`. On a CPU the spectrum is transposed: columns are transformed in one piece of memory, and
+    rows of zeros not at all.
     """
-    return torch.fft.rfft2(planes, s=(transform_side(size[0]), transform_side(size[1])))
+    height, width = transform_side(size[0]), transform_side(size[1])
+    if planes.device.type != "cpu":
+        return torch.fft.rfft2(planes, s=(height, width))
+    return torch.fft.fft(torch.fft.rfft(planes, n=width).mT.contiguous(), n=height)
 
 
 def from_spectrum(product: Tensor, size: tuple[int, int], psf_size: int) -> Tensor:
@@ -119,5 +123,8 @@ def from_spectrum(product: Tensor, size: tuple[int, int], psf_size: int) -> Tens
 
     The first ``psf_size - 1`` rows and columns hold what wrapped around.
     """
-    full = torch.fft.irfft2(product, s=(transform_side(size[0]), transform_side(size[1])))
-    return full[..., psf_size - 1 : size[0], psf_size - 1 : size[1]]
+    height, width = transform_side(size[0]), transform_side(size[1])
+    rows, columns = slice(psf_size - 1, size[0]), slice(psf_size - 1, size[1])
+    if product.device.type != "cpu":
+        return torch.fft.irfft2(product, s=(height, width))[..., rows, columns]
+    return torch.fft.irfft(torch.fft.ifft(product)[..., rows].mT.contiguous(), n=width)[..., columns]

@@ -102,7 +102,7 @@ class LayerBatches:
         whole: Tensor | None = None
         for part in self.parts:
             light, size = part.window(pixels[:, part.channels]), self._size(self.rim)
-            spectra = to_spectrum(self._own(light, part), size) * self._psfs(part, size, correlate)
+            spectra = to_spectrum(self._own(light, part), size).mul_(self._psfs(part, size, correlate))
             spread = from_spectrum(spectra.sum(1), size, 1)
             if len(self.parts) == 1:
                 return spread
