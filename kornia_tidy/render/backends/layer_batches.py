@@ -145,6 +145,7 @@ class LayerBatches:
     def _own(self, light: Tensor, part: Part) -> Tensor:
         """Return the light of each layer's own pixels, (B, D, C, h, w)."""
         index, weight = self._labels(part)
-        layers = torch.arange(len(part.chosen(self.psfs)), device=index.device)[:, None, None]
+        count = len(self.psfs) if part.layers is None else len(part.layers)
+        layers = torch.arange(count, device=index.device)[:, None, None]
         own = weight_of_layer(index[:, None], None if weight is None else weight[:, None], layers)
         return own.to(light.dtype)[:, :, None] * light[:, None]
