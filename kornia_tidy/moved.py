@@ -11,6 +11,9 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MOVED = {
+    "accuracy.plan": "accuracy.planning.plan",
+    "accuracy.planner": "accuracy.planning.planner",
+    "accuracy.render_plan": "accuracy.planning.render_plan",
     "app": "cli.app",
     "app.controls": "cli.app.settings",
     "calibration": "lab.calibration",

@@ -21,7 +21,7 @@ The sums over f are computed at some depths of the scene, and the power between 
 in amplitude, differences at two depths are assumed equal or independent, whichever gives the larger error.
 
 This is an estimate, which assumes that the light of an octave has random phases. The safety factors of
-:mod:`kornia_tidy.accuracy.planner` cover the deviation of real scenes.
+:mod:`kornia_tidy.accuracy.planning.planner` cover the deviation of real scenes.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burs
 exposure (``motion.py``), the distortion of a real lens (``lens_distortion.py``) and the transform of a data set
 (``dataset_transform.py``). ``samples.py`` reads the input of a camera, ``strips.py`` takes large images some rows at a
 time, ``camera_state.py`` holds its state, and ``saved_camera.py`` makes a camera from it, of ``saved_parts.py``. A
-capture is planned by ``../accuracy/planner.py``.
+capture is planned by ``../accuracy/planning/planner.py``.
 """
 
 from kornia_tidy.camera.burst import burst

@@ -47,7 +47,7 @@ from kornia_tidy.render.scene import layered_scene
 from kornia_tidy.sensor.sensor import Sensor, SensorNoise, check_sensor
 
 if TYPE_CHECKING:
-    from kornia_tidy.accuracy.render_plan import RenderPlan
+    from kornia_tidy.accuracy.planning.render_plan import RenderPlan
     from kornia_tidy.psf.wide_blur import WideBlur
 
 _DEFAULT_SENSOR = SensorNoise(0.01)
@@ -379,7 +379,7 @@ class TiDyOptics(CameraState):
 
     @torch.no_grad()
     def plan(self, depth: Tensor, image: Tensor | None = None, tolerance: float = 1e-3) -> RenderPlan:
-        """Return the cheapest way to capture a scene within an error. See :mod:`kornia_tidy.accuracy.planner`.
+        """Return the cheapest way to capture a scene within an error. See :mod:`kornia_tidy.accuracy.planning.planner`.
 
         Args:
             depth: (B, 1, H, W) or (1, H, W), as for a capture.
@@ -399,7 +399,7 @@ class TiDyOptics(CameraState):
             >>> plan.predicted_error <= 1e-2
             True
         """
-        from kornia_tidy.accuracy.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
+        from kornia_tidy.accuracy.planning.plan import plan_scene  # noqa: PLC0415 (a capture without a plan does not need it)
 
         shape = (len(self.spectrum.weights), *depth.shape[-2:])
         blank = depth.new_zeros(()).expand(*depth.shape[:-3], *shape) if image is None else image

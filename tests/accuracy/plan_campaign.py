@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from kornia_tidy import DefocusRange, FresnelLens, NoMask, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
 from kornia_tidy.accuracy import RenderPlan, psf_samples
 from kornia_tidy.accuracy.candidates import REFERENCE
-from kornia_tidy.accuracy.plan import LEAST_TOLERANCE, plan_scene
+from kornia_tidy.accuracy.planning.plan import LEAST_TOLERANCE, plan_scene
 from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import DiffractionEfficiency, DwellTimes, GreyLevels, SpatialLightModulator
 from kornia_tidy.optics import REFERENCE_WAVELENGTH, Lens, annular_aperture, camera_spectrum, circular_aperture

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, PSFBank, Spectrum, TiDyOptics
 from kornia_tidy.accuracy.candidates import LAYER_SPACINGS, REFERENCE
-from kornia_tidy.accuracy.planner import PlannedScene, Planner
+from kornia_tidy.accuracy.planning.planner import PlannedScene, Planner
 from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.render import render

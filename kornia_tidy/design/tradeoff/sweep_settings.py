@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from kornia_tidy.accuracy.planner import Planner
+from kornia_tidy.accuracy.planning.planner import Planner
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice
 from kornia_tidy.fidelity import LAYERS, PRESETS, Fidelity

@@ -35,8 +35,8 @@ from kornia_tidy.accuracy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_
 from kornia_tidy.accuracy.costs import bank_work, rendering_work, window_side
 from kornia_tidy.accuracy.depth_energy import Depths
 from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
+from kornia_tidy.accuracy.planning.render_plan import RenderPlan
 from kornia_tidy.accuracy.psf_samples import PSFSamples, remembered
-from kornia_tidy.accuracy.render_plan import RenderPlan
 from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity

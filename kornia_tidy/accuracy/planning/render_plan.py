@@ -16,7 +16,7 @@ class RenderPlan:
         reference: of the error: the preset ``reference``, with the window of the current masks.
         tolerance: largest error allowed.
         predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
-            an upper estimate, see :mod:`kornia_tidy.accuracy.planner` for its assumptions.
+            an upper estimate, see :mod:`kornia_tidy.accuracy.planning.planner` for its assumptions.
         error_parts: contributions to ``predicted_error``, by the name of the approximation.
         operations: of one capture with its PSFs, those of float64 counted twice.
         reference_operations: those of the reference.

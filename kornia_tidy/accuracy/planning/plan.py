@@ -9,9 +9,9 @@ from typing import Any
 from torch import Tensor
 
 from kornia_tidy.accuracy.costs import rendering_work
-from kornia_tidy.accuracy.planner import PlannedScene, Planner
-from kornia_tidy.accuracy.render_plan import RenderPlan
-from kornia_tidy.accuracy.wide_plan import plan_rays
+from kornia_tidy.accuracy.planning.planner import PlannedScene, Planner
+from kornia_tidy.accuracy.planning.render_plan import RenderPlan
+from kornia_tidy.accuracy.planning.wide_plan import plan_rays
 from kornia_tidy.checks import check_positive
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
 from kornia_tidy.optics.thin_lens import DefocusRange

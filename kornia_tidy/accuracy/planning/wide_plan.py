@@ -15,8 +15,8 @@ from torch import Tensor
 
 from kornia_tidy.accuracy.costs import bank_work, rendering_work
 from kornia_tidy.accuracy.error_model import change_error
-from kornia_tidy.accuracy.planner import FLOAT32_ERROR, PlannedScene
-from kornia_tidy.accuracy.render_plan import RenderPlan
+from kornia_tidy.accuracy.planning.planner import FLOAT32_ERROR, PlannedScene
+from kornia_tidy.accuracy.planning.render_plan import RenderPlan
 from kornia_tidy.psf.geometric_psf import blur_radius
 from kornia_tidy.psf.wide_blur import WideBlur
 from kornia_tidy.psf.wide_psfs import held_nodes
