@@ -24,6 +24,7 @@ from tests.test_kinds import argument, bound
 # Sums of 1e4 products in float32 at most, and gradients of theirs; see tests/test_accelerators.py.
 ROUNDING, OF_GRADIENTS = 1e-5, 1e-4
 EPSILON = {"occlusion": 1e-2}  # in float32 its divisors have a larger one: see tests/test_accelerators.py
+AMPLIFIED = {"joint": 1e-4}  # rounding the picture alone moves its output by up to 4e-5
 precisions = pytest.mark.parametrize("float64", [True, False], ids=["float64", "no_float64"])
 
 
@@ -92,7 +93,7 @@ class TestHeadsAndLosses(OnDevice):
         generator = torch.Generator().manual_seed(0)
         call = HEADS[name]()
         given = torch.rand(2, 3, 16, 16, generator=generator)
-        self.assert_agrees(call, given, float64)
+        self.assert_agrees(call, given, float64, AMPLIFIED.get(name, 0))
 
 
 @precisions
