@@ -1,8 +1,7 @@
 """Exact PSFs as one operator of torch: a compiled camera computes and remembers them as an eager one does.
 
 A compiler would unfold the sums over masks, wavelengths and depths into a graph of complex operations, which it cannot
-fuse, and would compute the PSFs anew for each capture. The gradient is a second operator, which computes them again:
-only the arguments are kept between the two.
+fuse, and would compute the PSFs anew for each capture.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kornia_tidy.kernels.operators import define, differentiable_gradients
-from kornia_tidy.mode import recording_in_operator
+from kornia_tidy.kernels.recomputed_ops import define_recomputed
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.psf.exact import exact_psf_bank
 from kornia_tidy.psf.psf_bank import PSFBank
@@ -102,40 +100,6 @@ def _psfs_fake(*arguments: Any) -> Tensor:
     return arguments[0].new_empty(_shape(*arguments))
 
 
-def _gradients(*arguments: Any) -> list[Tensor]:
-    phase, weights, *lens, gradient, wanted = arguments
-    given = (phase, weights)
-    with recording_in_operator(), torch.autocast(phase.device.type, enabled=False):
-        leaves = [x.detach().requires_grad_(want) for x, want in zip(given, wanted, strict=True)]
-        psfs = _computed(*leaves, *lens)
-        found = torch.autograd.grad(psfs, [x for x in leaves if x.requires_grad], gradient)
-    return [x.contiguous() for x in found]
-
-
-def _gradients_fake(*arguments: Any) -> list[Tensor]:
-    return [x.new_empty(x.shape) for x, want in zip(arguments[:2], arguments[-1], strict=True) if want]
-
-
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:_TENSORS])
-    ctx.lens = inputs[_TENSORS:]
-
-
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    (phase, weights, amplitude), wanted = ctx.saved_tensors, list(ctx.needs_input_grad[:2])
-    rest = [None] * (1 + len(ctx.lens))
-    if torch.is_grad_enabled():  # it is differentiated in turn
-
-        def made(*shown: Tensor) -> Tensor:
-            return _computed(*shown, amplitude, *ctx.lens)
-
-        with torch.autocast(gradient.device.type, enabled=False):
-            return *differentiable_gradients(made, (phase, weights), gradient, wanted), *rest
-    operator = torch.ops.kornia_tidy.exact_psfs_gradients
-    found = iter(operator(phase, weights, amplitude, *ctx.lens, gradient, wanted) if any(wanted) else ())
-    return *(next(found) if want else None for want in wanted), *rest
-
-
-_GRADIENTS = f"({_LENS}, Tensor gradient, bool[] wanted) -> Tensor[]"
-define("exact_psfs", f"({_LENS}) -> Tensor", _psfs, _psfs_fake, _backward, _keep, "default")
-define("exact_psfs_gradients", _GRADIENTS, _gradients, _gradients_fake, devices="default")
+define_recomputed(
+    "exact_psfs", _LENS, _TENSORS, _psfs, _psfs_fake, lambda *given: [(_computed(*given[:-1]), given[-1])], _computed
+)

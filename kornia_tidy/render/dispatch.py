@@ -1,8 +1,7 @@
 """The renderer: one operator of torch, which hands a layered scene to the backend that suits it.
 
 Compiled and exported graphs render by the same backends as eager code. The operator assigns the layers, chooses the
-backend and renders when it runs: which layers a tile holds depends on values, which a compiler does not know. Its
-gradient is a second operator, which makes the scene again: only the arguments are kept between the two.
+backend and renders when it runs: which layers a tile holds depends on values, which a compiler does not know.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_choice
-from kornia_tidy.kernels.operators import define, differentiable_gradients
-from kornia_tidy.mode import Mode, recording_in_operator, torch_mode
+from kornia_tidy.kernels.recomputed_ops import define_recomputed
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
-from kornia_tidy.render.backend import Backend, Work, wants_gradient
+from kornia_tidy.render.backend import Backend, GradientPairs, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
 from kornia_tidy.render.backends.compiled import CompiledBackend
 from kornia_tidy.render.backends.dense import DenseBackend
@@ -95,6 +94,8 @@ def render_layers(
     mode = torch_mode()
     if nodes.device.type != "cpu" and Mode.UNREAD not in mode:
         check_nodes(nodes)
+    if layers == "nearest" or len(nodes) == 1:  # nothing depends smoothly on defocus
+        defocus, nodes = defocus.detach(), nodes.detach()
     render = _rendered if Mode.TRANSFORM in mode else torch.ops.kornia_tidy.render_layers
     over = [] if field is None else [*field.size, *field.nodes, *field.origin, field.cell, field.still]
     return render(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, over, method)
@@ -204,7 +205,6 @@ _SCENE = (
     "Tensor image, Tensor defocus, Tensor nodes, Tensor psfs, Tensor? stray_light, str compositing, str layers,"
     " str border, bool correlate, int[] field, str method"
 )
-_TENSORS = 5  # of a scene, which may have gradients
 
 
 def _field(numbers: Sequence[int]) -> Field:
@@ -230,62 +230,21 @@ def _render_fake(*arguments: Any) -> Tensor:
     return image.new_empty(image.shape[0], image.shape[1], image.shape[2] - lost, image.shape[3] - lost)
 
 
-def _gradients(*arguments: Any) -> list[Tensor]:
-    tensors, (*options, over, method, gradient, wanted) = arguments[:_TENSORS], arguments[_TENSORS:]
+def _pairs(*arguments: Any) -> GradientPairs:
+    *given, over, method, gradient = arguments
     if not len(gradient):
-        return [torch.zeros_like(x) for x, want in zip(tensors, wanted, strict=True) if want and x is not None]
-    given = zip(tensors, wanted, strict=True)
-    own: list[Any] = [None if x is None else x.detach().requires_grad_(want) for x, want in given]
-    leaves = [x for x in own if x is not None and x.requires_grad]
-    with recording_in_operator(), torch.autocast(gradient.device.type, enabled=False):
-        scene = layered_scene(*own, *options, _field(over) if over else None)
-        pairs = choose(scene, method).gradients(scene, gradient.to(scene.image.dtype))
-        if scene.stray_light is not None and scene.compositing != "occlusion":
-            stray_light = stray_light_of(scene)
-            if stray_light.requires_grad:
-                pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
-        found: Sequence[Tensor | None] = [None] * len(leaves)
-        if pairs:
-            made, gradients = zip(*pairs, strict=True)
-            found = torch.autograd.grad(made, leaves, gradients, allow_unused=True)
-    return [
-        torch.zeros_like(leaf, memory_format=torch.contiguous_format) if x is None else x.contiguous()
-        for x, leaf in zip(found, leaves, strict=True)
-    ]
+        return []
+    scene = layered_scene(*given, _field(over) if over else None)
+    pairs = choose(scene, method).gradients(scene, gradient.to(scene.image.dtype))
+    if scene.stray_light is not None and scene.compositing != "occlusion":
+        stray_light = stray_light_of(scene)
+        if stray_light.requires_grad:
+            pairs.append((stray_light, gradient.to(stray_light.dtype).sum_to_size(stray_light.shape)))
+    return pairs
 
 
-def _gradients_fake(*arguments: Any) -> list[Tensor]:
-    pairs = zip(arguments[:_TENSORS], arguments[-1], strict=True)
-    return [x.new_empty(x.shape) for x, want in pairs if want and x is not None]
+def _densely(*arguments: Any) -> Tensor:
+    return _rendered(*arguments[:-1], "dense")
 
 
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*inputs[:_TENSORS])
-    ctx.options = inputs[_TENSORS:]
-
-
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    tensors, options = ctx.saved_tensors, ctx.options[:-1]
-    layered = options[1] == "linear" and len(tensors[2]) > 1  # otherwise nothing depends smoothly on defocus
-    wanted = [
-        bool(want and x is not None and (layered or n not in (1, 2)))
-        for n, (x, want) in enumerate(zip(tensors, ctx.needs_input_grad, strict=False))
-    ]
-    rest = [None] * len(ctx.options)
-    if torch.is_grad_enabled():  # it is differentiated in turn
-
-        def render(*tensors: Any) -> Tensor:
-            return _rendered(*tensors, *options, "dense")
-
-        with torch.autocast(gradient.device.type, enabled=False):
-            return *differentiable_gradients(render, tensors, gradient, wanted), *rest
-    found = iter(
-        torch.ops.kornia_tidy.render_layers_gradients(*tensors, *ctx.options, gradient, wanted) if any(wanted) else ()
-    )
-    return *(next(found) if want else None for want in wanted), *rest
-
-
-_computed = torch.no_grad()(_rendered)
-_GRADIENTS = f"({_SCENE}, Tensor gradient, bool[] wanted) -> Tensor[]"
-define("render_layers", f"({_SCENE}) -> Tensor", _computed, _render_fake, _backward, _keep, "default")
-define("render_layers_gradients", _GRADIENTS, _gradients, _gradients_fake, devices="default")
+define_recomputed("render_layers", _SCENE, 5, torch.no_grad()(_rendered), _render_fake, _pairs, _densely)

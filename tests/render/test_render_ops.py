@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from kornia_tidy.render.compositing import COMPOSITING, render
+from kornia_tidy.render.compositing import COMPOSITING, gather, render
 from tests.base import BaseTester
 from tests.render.scenes import Bank, make_bank, make_scene
 
@@ -112,8 +112,8 @@ class TestRenderLayers(BaseTester):
             assert torch.equal(one, other)
 
     def test_feature_nearest_layers_give_defocus_and_nodes_no_gradient(self):
-        inputs = arguments(layers="nearest")
-        found = torch.autograd.grad(RENDER(*inputs).sum(), inputs[:5], allow_unused=True)
+        scene = arguments()[:5]
+        found = torch.autograd.grad(gather(*scene, layers="nearest").sum(), scene, allow_unused=True)
         assert [x is None for x in found] == [False, True, True, False, False]
 
     @pytest.mark.parametrize("compositing", COMPOSITING)
