@@ -13,13 +13,14 @@ convolved on a grid of 2, 4, 8, ... pixels, on which the radius is between 12 an
 
 All three arise at the edges of a PSF, which is an image of the aperture. Other apertures than the disc have longer
 edges, or edges that move farther with defocus. Their layers stand closer, and rays and grids begin at larger radii, by
-the factors of :class:`EdgeFactors`, so that the errors are those of the disc.
+the factors of :func:`edge_factors`, so that the errors are those of the disc.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 
 import torch
 from torch.nn.functional import pad
@@ -40,9 +41,8 @@ _SPACING, _RADIUS = 0.4, 3.0  # pixels between layers of larger discs, at this r
 _DISC_LENGTH, _DISC_SHIFT = 0.8359, 0.4796  # of the disc on 23 cells
 
 
-@dataclass(frozen=True)
-class EdgeFactors:
-    r"""How long the edges of an aperture are for its light, and how far they move with defocus.
+def edge_factors(pupil: Pupil) -> tuple[float, float]:
+    r"""Return how long the edges of an aperture are for its light, and how far they move with defocus.
 
     With the jumps :math:`|\Delta t|` of the transmission between cells of side a, at the distance x from the axis along
     the edge's normal, the light :math:`A = \sum t a^2` and the same sums of the disc,
@@ -53,34 +53,24 @@ class EdgeFactors:
     length of the edges and, from layers, with the third power of their shift: mean squares go with l and m.
 
     Args:
-        length: l over that of the disc.
-        shift: m over that of the disc.
+        pupil: the aperture.
+
+    Returns:
+        Length l and shift m, each over that of the disc.
 
     Example:
         >>> from kornia_tidy.optics.aperture import annular_aperture, circular_aperture
         >>> for aperture in (circular_aperture(23), annular_aperture(23, 0.1, 0.5)):
-        ...     edges = EdgeFactors.of(Pupil(aperture, 0.1))
-        ...     print(round(edges.length, 2), round(edges.shift, 2))
-        1.0 1.0
-        2.75 1.92
+        ...     print([round(factor, 2) for factor in edge_factors(Pupil(aperture, 0.1))])
+        [1.0, 1.0]
+        [2.75, 1.92]
     """
-
-    length: float
-    shift: float
-
-    @classmethod
-    def of(cls, pupil: Pupil) -> EdgeFactors:
-        """Return the edges of an aperture."""
-        light = pad(pupil.transmission.cpu(), (1, 1, 1, 1))
-        at = (
-            torch.arange(light.shape[-1] - 1, dtype=torch.float64) - (light.shape[-1] - 2) / 2
-        ).abs() * pupil.cell_pitch
-        length = shift = 0.0
-        for jumps in (light.diff(dim=1), light.diff(dim=0).mT):
-            length += float(jumps.abs().sum())
-            shift += float((jumps.abs() * at**3).sum())
-        scale = pupil.cell_pitch / float(pupil.transmission.sum() * pupil.cell_pitch**2) ** 2
-        return cls(length * scale / _DISC_LENGTH, shift * scale / _DISC_SHIFT)
+    light = pad(pupil.transmission.cpu(), (1, 1, 1, 1))
+    edges = torch.arange(light.shape[-1] - 1, dtype=torch.float64) - (light.shape[-1] - 2) / 2
+    jumps = torch.cat([light.diff(dim=1), light.diff(dim=0).mT]).abs()
+    scale = pupil.cell_pitch / float(pupil.transmission.sum() * pupil.cell_pitch**2) ** 2
+    length, shift = jumps.sum(), (jumps * (edges.abs() * pupil.cell_pitch) ** 3).sum()
+    return float(length) * scale / _DISC_LENGTH, float(shift) * scale / _DISC_SHIFT
 
 
 @dataclass(frozen=True)
@@ -106,13 +96,11 @@ class WideBlur:
         groups: see :class:`BlurGroup`.
         window: side in sensor pixels that holds the PSFs of all layers.
         ray_radius: radius of the disc in pixels from which on PSFs are geometric.
-        error: root mean square error of an image, from layers, grids and rays, see the module.
     """
 
     groups: tuple[BlurGroup, ...]
     window: int
     ray_radius: float
-    error: float
 
     @property
     def nodes(self) -> tuple[float, ...]:
@@ -129,7 +117,7 @@ def ray_error(radius: float, step: float, length: float = 1.0) -> float:
     Args:
         radius: r of the disc in pixels.
         step: s, a sensor pixel seen from the pupil in metres.
-        length: l of the aperture's edges, see :class:`EdgeFactors`.
+        length: l of the aperture's edges, see :func:`edge_factors`.
 
     Example:
         >>> round(ray_error(20.0, 1.63e-6), 5)  # measured at f/1.8: 5.4e-4
@@ -169,28 +157,21 @@ def wide_blur(defocus_range: tuple[float, float], step: float, pupil: Pupil) -> 
     """
     lo, hi = defocus_range
     per_pixel = math.pi * step / REFERENCE_WAVELENGTH  # radians of defocus for a pixel of radius
-    edges = EdgeFactors.of(pupil)
-    ray_radius = (ray_error(1.0, step, edges.length) / RAY_TOLERANCE) ** 2
-    finest = FINE_RADIUS * max(1.0, edges.length) ** (1 / 3)
-    far, near = (_radii(max(0.0, end) / per_pixel, finest, edges.shift) for end in (-lo, hi))
+    length, shift = edge_factors(pupil)
+    ray_radius = (ray_error(1.0, step, length) / RAY_TOLERANCE) ** 2
+    finest = FINE_RADIUS * max(1.0, length) ** (1 / 3)
+    far, near = (_radii(max(0.0, end) / per_pixel, finest, shift) for end in (-lo, hi))
     radii = sorted({*(-r for r in far), *near})
     radii = [r for r in radii if lo - 1e-9 <= r * per_pixel <= hi + 1e-9] or [lo / per_pixel, hi / per_pixel]
     radii[0], radii[-1] = lo / per_pixel, hi / per_pixel
     groups = []
-    first = 0
-    while first < len(radii) - 1:
-        grid, last = _grid(radii[first], radii[first + 1], finest), first + 1
-        while last < len(radii) - 1 and _grid(radii[last], radii[last + 1], finest) == grid:
-            last += 1
-        largest = max(abs(radii[first]), abs(radii[last]))
-        nodes = tuple(r * per_pixel for r in radii[first : last + 1])
-        groups.append(BlurGroup(grid, nodes, window_of(largest, step, pupil.extent, grid)))
-        first = last
+    for grid, pairs in groupby(pairwise(radii), lambda pair: _grid(*pair, finest)):
+        first, *rest = pairs
+        own = (*first, *(radius for _, radius in rest))
+        nodes = tuple(radius * per_pixel for radius in own)
+        groups.append(BlurGroup(grid, nodes, window_of(max(map(abs, own)), step, pupil.extent, grid)))
     window = window_of(max(-radii[0], radii[-1]), step, pupil.extent)
-    least = max(ray_radius, 1.0)
-    rays = min(RAY_TOLERANCE, ray_error(least, step, edges.length))
-    error = math.sqrt(LAYER_ERROR**2 + GRID_ERROR**2 + rays**2)
-    return WideBlur(tuple(groups), window, ray_radius, error)
+    return WideBlur(tuple(groups), window, ray_radius)
 
 
 def window_of(radius: float, step: float, extent: float, grid: int = 1) -> int:
@@ -236,7 +217,4 @@ def _radii(largest: float, finest: float, shift: float) -> list[float]:
 
 def _grid(one: float, other: float, finest: float) -> int:
     """Return the grid on which the discs between two radii are convolved."""
-    middle, grid = abs(one + other) / 2, 1
-    while middle >= finest * grid:
-        grid *= 2
-    return grid
+    return 2 ** max(0, math.frexp(abs(one + other) / 2 / finest)[1])
