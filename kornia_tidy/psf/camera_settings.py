@@ -118,10 +118,10 @@ def check_settings(saved: Mapping[str, Any], here: Mapping[str, Any]) -> None:
 
 
 def take_over(owner: Any, saved: Mapping[str, Any], here: Mapping[str, Any], names: Mapping[str, str]) -> None:
-    """Set the settings of a camera to those of a saved one: all of them or, where one cannot be set, none.
+    """Set the settings of a camera to those of a saved one.
 
     Args:
-        owner: the camera.
+        owner: the camera. After an error some settings are set.
         saved: settings of the saved camera, by the names of the parts.
         here: those of this camera.
         names: the attribute of each part that can be set.
@@ -129,14 +129,11 @@ def take_over(owner: Any, saved: Mapping[str, Any], here: Mapping[str, Any], nam
     Raises:
         ValueError: if a part is of another class than the saved one, or a setting cannot be made from a file.
     """
-    changes: list[tuple[Any, str, Any]] = []
     for part in here:
         if part in saved and part in names:
-            _collect(owner, names[part], saved[part], part, changes)
+            _take(owner, names[part], saved[part], part)
         elif part in saved and (found := _difference(saved[part], here[part], part)):
             raise ValueError(_no_way(*found))
-    for place, attribute, value in changes:
-        setattr(place, attribute, value)
 
 
 def _described(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -201,19 +198,19 @@ def _short(value: Any) -> str:
     return text if len(text) < 80 else f"{text[:76]} ..."
 
 
-def _collect(owner: Any, attribute: str, saved: Any, place: str, changes: list[tuple[Any, str, Any]]) -> None:
-    """List the attributes to set so that a part gets its saved settings."""
+def _take(owner: Any, attribute: str, saved: Any, place: str) -> None:
+    """Give a part its saved settings."""
     current = getattr(owner, attribute)
     here = settings_of(current)
     if not isinstance(current, nn.Module):
-        if settings_of(current) != saved:
-            changes.append((owner, attribute, _made(current, saved, place)))
+        if here != saved:
+            setattr(owner, attribute, _made(current, saved, place))
         return
     if not isinstance(saved, dict) or saved.get("is") != here["is"] or saved.keys() != here.keys():
         raise ValueError(_no_way(place, saved, here))
     for name in saved:
         if name != "is":
-            _collect(current, name, saved[name], f"{place}.{name}", changes)
+            _take(current, name, saved[name], f"{place}.{name}")
 
 
 def _made(current: Any, saved: Any, place: str) -> Any:
