@@ -307,7 +307,8 @@ class PSFModel:
             channels: of the image: those of the spectrum, or 1.
             dtype: float32 or float64.
             defocus: the scene's defocus in radians, any shape.
-            each_state: the PSFs of each state of the exposure in one bank, (D, S C, P, P), and not their average.
+            each_state: the PSFs of each state of the exposure in one bank, (D, S C, P, P), and not their average; of an
+                ideal lens.
             device: of measured PSFs. Default: that of ``defocus``.
             field: of the picture, behind a real lens: the PSFs at its nodes.
         """
@@ -500,13 +501,8 @@ class PSFModel:
         dispersion = [self.masks.dispersion(wavelength) for wavelength in spectrum.wavelengths]
         shift = [self.camera.chromatic_defocus(wavelength) for wavelength in spectrum.wavelengths]
         if self.lens is not None:
-            rest = nodes, window, points, tolerance or self.fidelity.pixel_tolerance
-            if each_state:
-                one, shown = torch.ones_like(weights[:1]), enumerate(states[:, None])
-                found = [field_psfs(own, one, **self.of_state(k)._of_lens(spectrum, *rest))[0] for k, own in shown]
-                psfs = torch.cat(found, 1).flatten(1, 2)
-            else:
-                psfs = field_psfs(states, weights, **self._of_lens(spectrum, *rest))[0].flatten(1, 2)
+            given = self._of_lens(spectrum, nodes, window, points, tolerance or self.fidelity.pixel_tolerance)
+            psfs = field_psfs(states, weights, **given)[0].flatten(1, 2)
             return PSFBank(psfs, states.new_tensor(nodes), psfs.sum((2, 3)))
         if self.fidelity.propagation == "paper":
             if pupil.fill_factor != 1:
