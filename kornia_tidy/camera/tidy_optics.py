@@ -35,14 +35,14 @@ from kornia_tidy.optics.holes import HOLES
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.psf.field import Field, check_center
+from kornia_tidy.psf.field import check_center
 from kornia_tidy.psf.learnable_aperture import LearnableAperture
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.psf.wide_psfs import held_nodes
 from kornia_tidy.render.borders import BORDERS, check_border, cropped
 from kornia_tidy.render.compositing import COMPOSITING
 from kornia_tidy.render.dispatch import Explanation, Rendering, explain
-from kornia_tidy.render.pieces import comes_in_pieces, pieces_of, render_piece
+from kornia_tidy.render.pieces import pieces_of, render_piece
 from kornia_tidy.render.scene import layered_scene
 from kornia_tidy.sensor.sensor import Sensor, SensorNoise, check_sensor
 
@@ -85,9 +85,9 @@ class TiDyOptics(CameraState):
         check_inputs: look at the values of images and depths before any work, eagerly. Inputs in another unit (depth in
             millimetres, images in 0..255 or normalised) give one warning with the remedy. A sensor checks its light
             in any case.
-        memory_budget: bytes that a capture without gradients may take beyond image and capture. Larger images go
-            through in bands of 64 rows or more, and PSFs that exceed half of it are computed in pieces, some layers at
-            a time, also with gradients. That changes nothing but the last digits.
+        memory_budget: bytes that a capture without gradients may take beyond image and capture. Images that take half
+            of it go through in bands of 64 rows or more, and PSFs that exceed the other half are computed in pieces,
+            some layers at a time, also with gradients. That changes nothing but the last digits.
         holes: ``"error"`` refuses a depth of NaN, 0 or less; ``"fill"`` fills such pixels from the nearest known one,
             as :func:`kornia_tidy.data.fill_holes` does, with gradients and in compiled graphs. Like ``check_inputs`` it
             is not part of the state.
@@ -284,7 +284,7 @@ class TiDyOptics(CameraState):
         centers = () if alike else sample.centers or (self.field_center,)
         found = [self.psf_model.field_of(size, center) for center in centers]
         fields = tuple(field for field in found if field is not None)
-        rows = self._rows_at_once(sample, fields) if sample.bytes_at_once > self.memory_budget // 2 else None
+        rows = self._rows_at_once(sample) if sample.bytes_at_once > self.memory_budget // 2 else None
         if rows is None:
             image, depth = sample.image.to(sample.dtype), sample.depth.to(sample.dtype)
             unread = Mode.UNREAD in torch_mode()
@@ -330,8 +330,8 @@ class TiDyOptics(CameraState):
         """Return how many rows a capture has."""
         return sample.image.shape[-2] - (self.window - 1 if self.border == "valid" else 0)
 
-    def _rows_at_once(self, sample: Sample, fields: tuple[Field, ...]) -> int | None:
-        """Return how many rows fit the memory allowed; None where all do, or the whole image is needed at once."""
+    def _rows_at_once(self, sample: Sample) -> int | None:
+        """Return how many rows fit half of the memory allowed; None where the whole image is needed at once."""
         image, depth = sample.image, sample.depth
         learning = torch.is_grad_enabled() and (
             image.requires_grad or depth.requires_grad or any(p.requires_grad for p in self.parameters())
@@ -341,10 +341,7 @@ class TiDyOptics(CameraState):
         unseen = self.compositing == "occlusion" and self.border == "zero"
         if learning or torch_mode() & Mode.TRACED or spread or unseen or not len(image):
             return None
-        allowed, points = self.memory_budget, max((len(field.points) for field in fields), default=1)
-        if comes_in_pieces(self.psf_model, image.shape[1], sample.dtype, self.compositing, allowed, points):
-            allowed //= 2  # the other half is for PSFs
-        return None if sample.bytes_at_once <= allowed else rows_at_once(sample, allowed)
+        return rows_at_once(sample, self.memory_budget // 2)  # the other half is for PSFs
 
     def _replace(self, **attributes: Any) -> Self:
         """Return a camera with other attributes. Parts, notes and remembered PSFs are shared."""

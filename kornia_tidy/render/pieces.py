@@ -128,7 +128,7 @@ def pieces_of(
         make = partial(_with_tails, make)
     if compositing == "occlusion" and model.measured is None and model.fidelity.occlusion_states == "each":
         shares = model.state_weights(dtype)
-        if Mode.UNREAD in mode and field is None:  # all states in one bank, for one rendering
+        if Mode.UNREAD in mode and model.lens is None:  # all states in one bank, for one rendering
             yield Piece(partial(make, source, defocus=reach, each_state=True), shares)
             return
         for state, share in enumerate(shares):
@@ -191,23 +191,6 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     if planes > 1:
         seen = seen.unflatten(1, (-1, planes)).sum(2)
     return seen if isinstance(piece.share, float) and piece.share == 1 else seen * piece.share
-
-
-def comes_in_pieces(
-    model: PSFModel, channels: int, dtype: torch.dtype, compositing: str, budget: int, points: int = 1
-) -> bool:
-    """Return whether PSFs of all the camera's range exceed their share of a memory budget. See :func:`pieces_of`.
-
-    Args:
-        model: this and the next four arguments are those of :func:`pieces_of`.
-        channels: as there.
-        dtype: as there.
-        compositing: as there.
-        budget: as there.
-        points: of the field, behind a real lens.
-    """
-    reach = torch.tensor(model.camera.defocus_range, dtype=torch.float64)
-    return _most_layers(model, channels, dtype, reach, compositing, budget, points)[0] is not None
 
 
 def layer_bytes(model: PSFModel, channels: int, dtype: torch.dtype) -> tuple[int, int]:

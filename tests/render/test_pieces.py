@@ -13,7 +13,7 @@ from kornia_tidy.design.tradeoff.costs import peak_bytes
 from kornia_tidy.psf import exact, psf_cache, psf_model
 from kornia_tidy.render import pieces
 from kornia_tidy.render.dispatch import Rendering
-from kornia_tidy.render.pieces import Piece, comes_in_pieces, layer_bytes, pieces_of, render_piece, runs_of
+from kornia_tidy.render.pieces import Piece, layer_bytes, pieces_of, render_piece, runs_of
 from tests.base import BaseTester
 
 # Layer weights carry a rounding of defocus over the layers' spacing, 1e2 units of the last place; PSFs and transforms
@@ -146,9 +146,3 @@ class TestBudget(BaseTester):
         assert taken < budget < peak_bytes(lambda: found.append(whole(image, depth)), image.device)
         # In float32 defocus of 300 rad over 2 rad between layers: 150 units of the last place, and those of transforms.
         self.assert_close(found[0], found[1], rtol=0, atol=1e3 * torch.finfo(torch.float32).eps)
-
-    def test_feature_image_and_psfs_share_the_budget(self):
-        """631 layers of at most 2 MiB want more than half of 64 MiB, the 11 layers of 7 px do not."""
-        budget = 64 << 20
-        assert comes_in_pieces(fast_optics(budget).psf_model, 1, torch.float32, "gather", budget)
-        assert not comes_in_pieces(make_optics().psf_model, 1, torch.float32, "gather", budget)
