@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kornia_tidy import choices
-from kornia_tidy.camera import camera_state
+from kornia_tidy.camera import tidy_optics
 from kornia_tidy.design.tradeoff import PLAN, SWEEP_VALUES
 from kornia_tidy.fidelity import PRESETS
 from kornia_tidy.lab.mask_export import placement
@@ -36,7 +36,7 @@ class TestChoices(BaseTester):
             ("COMPOSITING", compositing.COMPOSITING),
             ("BORDERS", borders.BORDERS),
             ("STRAY_LIGHT", psf_bank.STRAY_LIGHT),
-            ("COLOR_SPACES", camera_state.COLOR_SPACES),
+            ("COLOR_SPACES", tidy_optics.COLOR_SPACES),
             ("HOLES", HOLES),
             ("SYSTEMS", SYSTEMS),
             ("LENSES", NAMED_LENSES),

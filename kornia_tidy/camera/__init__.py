@@ -3,8 +3,8 @@
 Read ``tidy_optics.py`` first. Beside it stand shots read out one by one (``burst.py``), scenes that move during the
 exposure (``motion.py``), the distortion of a real lens (``lens_distortion.py``) and the transform of a data set
 (``dataset_transform.py``). ``samples.py`` reads the input of a camera, ``strips.py`` takes large images some rows at a
-time, ``camera_state.py`` holds its state, and ``saved_camera.py`` makes a camera from it, of ``saved_parts.py``. A
-capture is planned by ``../accuracy/planning/planner.py``.
+time, and ``saved_camera.py`` makes a camera from its state, of ``saved_parts.py``. A capture is planned by
+``../accuracy/planning/planner.py``.
 """
 
 from kornia_tidy.camera.burst import burst
