@@ -99,35 +99,36 @@ static char *lay_out(matrix *m, const REAL *from, int64_t rows, int64_t inner, i
     return memory + matrix_size(rows, inner);
 }
 
-INLINE void add_products(const REAL *numbers, int64_t step, const vec *x, int64_t pitch, int64_t inner, int64_t vecs, int count,
-                         vec *out) {
-    vec sums[BLOCK][SPAN];
+INLINE void add_products(const REAL *numbers, int64_t step, int64_t next, const vec *x, int64_t pitch, int64_t inner, int64_t vecs,
+                         int rows, int count, vec *out) {
+    vec sums[2 * BLOCK][SPAN];
     memset(sums, 0, sizeof sums);
     for (int64_t i = 0; i < inner; i++, numbers += step, x += pitch)
-#pragma GCC unroll 4
-        for (int n = 0; n < BLOCK; n++)
+#pragma GCC unroll 8
+        for (int n = 0; n < rows; n++)
 #pragma GCC unroll 6
-            for (int v = 0; v < count; v++) sums[n][v] += numbers[n] * x[v];
-    for (int n = 0; n < BLOCK; n++)
+            for (int v = 0; v < count; v++) sums[n][v] += numbers[n / BLOCK * next + n % BLOCK] * x[v];
+    for (int n = 0; n < rows; n++)
         for (int v = 0; v < count; v++) out[n * vecs + v] = sums[n][v];
 }
 
-// out (BLOCK, vecs) = a block of a matrix, with a column every few numbers, x rows of vectors.
-INLINE void multiply_block(const REAL *numbers, int64_t step, const vec *x, int64_t pitch, int64_t inner, int64_t vecs, vec *out) {
+// out (rows, vecs) = one block of a matrix or two, `next` numbers apart, with a column every few numbers, x rows of vectors.
+INLINE void multiply_block(const REAL *numbers, int64_t step, int64_t next, const vec *x, int64_t pitch, int64_t inner,
+                           int64_t vecs, int rows, vec *out) {
+    const int span = rows == BLOCK ? SPAN : SPAN / 2;
     int64_t v = 0;
-    for (; v + SPAN <= vecs; v += SPAN) add_products(numbers, step, x + v, pitch, inner, vecs, SPAN, out + v);
-    if (vecs - v == 5) add_products(numbers, step, x + v, pitch, inner, vecs, 5, out + v);
-    else if (vecs - v == 4) add_products(numbers, step, x + v, pitch, inner, vecs, 4, out + v);
-    else if (vecs - v == 3) add_products(numbers, step, x + v, pitch, inner, vecs, 3, out + v);
-    else if (vecs - v == 2) add_products(numbers, step, x + v, pitch, inner, vecs, 2, out + v);
-    else if (vecs - v == 1) add_products(numbers, step, x + v, pitch, inner, vecs, 1, out + v);
+    for (; v + span <= vecs; v += span) add_products(numbers, step, next, x + v, pitch, inner, vecs, rows, span, out + v);
+#pragma GCC unroll 5
+    for (int rest = span - 1; rest > 0; rest--)
+        if (vecs - v == rest) add_products(numbers, step, next, x + v, pitch, inner, vecs, rows, rest, out + v);
 }
 
 // out (padded rows, vecs) = matrix (rows, inner) x every few rows of (inner, vecs).
 static void multiply_rows(const matrix *m, const vec *x, int64_t pitch, int64_t vecs, vec *out) {
     for (int64_t b = 0; b < m->blocks; b++, out += BLOCK * vecs) {
         const int64_t first = m->first[b];
-        multiply_block(m->numbers + (b * m->inner + first) * BLOCK, BLOCK, x + first * pitch, pitch, m->after[b] - first, vecs, out);
+        const REAL *numbers = m->numbers + (b * m->inner + first) * BLOCK;
+        multiply_block(numbers, BLOCK, 0, x + first * pitch, pitch, m->after[b] - first, vecs, BLOCK, out);
     }
 }
 
@@ -320,8 +321,8 @@ typedef struct {
     vec *patch, *turned; // (rows, vecs)
     vec *folded[2];      // (extent / 2 + 1, folded): sums of mirrored rows, and differences times -i; columns alike
     vec *sets[4];        // (quarter, folded): transforms of sums of even and odd rows, and of their differences
-    REAL *blocks[2];     // (samples / 2 and more, extent / 2 + 1 and more, BLOCK): sum and difference of columns for mirrored rows of samples
-    vec *parts[4];       // (samples / 2, BLOCK, along): transforms of their even and odd columns
+    REAL *blocks[2];     // (2, extent / 2 + 1 and more, BLOCK): sum and difference of columns for rows of samples, near and far
+    vec *parts[4];       // (2, BLOCK, along): transforms of their even and odd columns
     vec *light;          // (samples, 4, along): average over states of squared moduli, see at_y
     vec *lines;          // (window, 4, along): light summed to columns of pixels
     vec *turned_lines;   // (samples, beside): the same the other way round
@@ -403,65 +404,60 @@ static void unfold(const work *w, REAL *grid, const desk *d) {
     }
 }
 
-// Transforms the grid of a state to the parts of its samples.
-static void transform_state(const work *w, int64_t k, const desk *d) {
-    const int64_t quarter = w->s->quarter, half = w->s->samples / 2, inner = w->s->extent / 2 + 1, vecs = w->folded;
-    fold(w, (const REAL *)grid_row(w, d->grids, k * w->s->extent), d);
-    for (int n = 0; n < 4; n++)
-        multiply_rows((n < 2 ? &w->cosines : &w->sines)->rows + n % 2, d->folded[n / 2] + n % 2 * vecs, 2 * vecs, vecs, d->sets[n]);
-    for (int odd = 0; odd < 2; odd++)
-        for (int64_t j = 0; j < quarter; j++) {
-            const REAL *set[4];
-            for (int n = 0; n < 4; n++) set[n] = (const REAL *)(d->sets[n] + j * vecs) + odd * 2 * inner;
-            REAL *near = d->blocks[odd] + j * w->block, *far = d->blocks[odd] + (2 * quarter - 1 - j) * w->block;
-            for (int64_t m = 0; m < 2 * inner; m += LANES) {
-                const vec a = *(const loose *)(set[0] + m), b = *(const loose *)(set[1] + m), c = *(const loose *)(set[2] + m),
-                          e = *(const loose *)(set[3] + m);
-                const vec high = (a + b) + (c + e), low = (a + b) - (c + e), there = (a - b) + (e - c), back = (a - b) - (e - c);
-                *(loose *)(near + 2 * m) = PICK(high, low, FIRST_HALVES);
-                *(loose *)(near + 2 * m + LANES) = PICK(high, low, SECOND_HALVES);
-                *(loose *)(far + 2 * m) = PICK(there, back, FIRST_HALVES);
-                *(loose *)(far + 2 * m + LANES) = PICK(there, back, SECOND_HALVES);
-            }
+// The sums and differences of columns for mirrored rows of samples near the middle, and far from it: half a period away.
+static void fill_blocks(const work *w, int64_t j, const desk *d) {
+    const int64_t inner = w->s->extent / 2 + 1;
+    for (int odd = 0; odd < 2; odd++) {
+        const REAL *set[4];
+        for (int n = 0; n < 4; n++) set[n] = (const REAL *)(d->sets[n] + j * w->folded) + odd * 2 * inner;
+        REAL *near = d->blocks[odd], *far = near + w->block;
+        for (int64_t m = 0; m < 2 * inner; m += LANES) {
+            const vec a = *(const loose *)(set[0] + m), b = *(const loose *)(set[1] + m), c = *(const loose *)(set[2] + m),
+                      e = *(const loose *)(set[3] + m);
+            const vec high = (a + b) + (c + e), low = (a + b) - (c + e), there = (a - b) + (e - c), back = (a - b) - (e - c);
+            *(loose *)(near + 2 * m) = PICK(high, low, FIRST_HALVES);
+            *(loose *)(near + 2 * m + LANES) = PICK(high, low, SECOND_HALVES);
+            *(loose *)(far + 2 * m) = PICK(there, back, FIRST_HALVES);
+            *(loose *)(far + 2 * m + LANES) = PICK(there, back, SECOND_HALVES);
         }
-    for (int n = 0; n < 4; n++) {
-        const vec *table = (n < 2 ? &w->cosines : &w->sines)->table[n % 2];
-        for (int64_t j = 0; j < half; j++)
-            multiply_block(d->blocks[n / 2] + j * w->block + n % 2 * BLOCK, 2 * BLOCK, table, w->along, (inner + 1 - n % 2) / 2, w->along,
-                           d->parts[n] + j * BLOCK * w->along);
     }
 }
 
-static void transform_state_back(const work *w, int64_t k, const desk *d) {
-    const int64_t quarter = w->s->quarter, half = w->s->samples / 2, inner = w->s->extent / 2 + 1, pitch = w->upright * LANES;
-    for (int n = 0; n < 4; n++) memset(d->sets[n], 0, quarter * w->folded * sizeof(vec));
-    for (int odd = 0; odd < 2; odd++)
-        for (int64_t j = 0; j < half; j++) {
-            for (int n = 0; n < 2; n++) {
-                const REAL *part = (const REAL *)(d->parts[2 * odd + n] + j * BLOCK * w->along);
-                for (int64_t q = 0; q < quarter; q++)
-                    for (int r = 0; r < BLOCK; r++) d->turned_parts[q * BLOCK + r] = part[r * w->along * LANES + q];
-                multiply_block(d->turned_parts, BLOCK, (odd ? &w->sines : &w->cosines)->table_back[n], w->upright, quarter, w->upright,
-                               d->block[n]);
-            }
-            const int64_t at = j < quarter ? j : 2 * quarter - 1 - j;
-            const REAL sign = j < quarter ? 1 : -1;
-            REAL *set[4];
-            for (int n = 0; n < 4; n++) set[n] = (REAL *)(d->sets[n] + at * w->folded) + odd * 2 * inner;
-            for (int64_t m = 0; m < inner; m++)
-                for (int n = 0; n < 2; n++) {
-                    const REAL *block = (const REAL *)d->block[m % 2] + m / 2, high = block[n * pitch], low = block[(2 + n) * pitch];
-                    set[0][2 * m + n] += high + low, set[1][2 * m + n] += sign * (high + low);
-                    set[2][2 * m + n] += sign * (high - low), set[3][2 * m + n] += high - low;
-                }
-        }
+// Transforms one block or two to the parts of their samples. Registers may hold both.
+static void transform_blocks(const work *w, int count, const desk *d) {
+    const int64_t inner = w->s->extent / 2 + 1, along = w->along;
     for (int n = 0; n < 4; n++) {
-        const matrix *rows = (n < 2 ? &w->cosines : &w->sines)->rows_back + n % 2;
-        multiply(rows, d->sets[n], w->folded, d->rows_back);
-        for (int64_t i = n % 2; i < inner; i += 2)
-            memcpy(d->folded[n / 2] + i * w->folded, d->rows_back + i / 2 * w->folded, w->folded * sizeof(vec));
+        const vec *table = (n < 2 ? &w->cosines : &w->sines)->table[n % 2];
+        const REAL *block = d->blocks[n / 2] + n % 2 * BLOCK;
+        const int64_t columns = (inner + 1 - n % 2) / 2;
+        if (count == 2 && REGISTERS == 32) multiply_block(block, 2 * BLOCK, w->block, table, along, columns, along, 2 * BLOCK, d->parts[n]);
+        else
+            for (int far = 0; far < count; far++)
+                multiply_block(block + far * w->block, 2 * BLOCK, 0, table, along, columns, along, BLOCK, d->parts[n] + far * BLOCK * along);
     }
-    unfold(w, (REAL *)grid_row(w, d->grids, k * w->s->extent), d);
+}
+
+// The transpose of both, from the gradients of a block's parts.
+static void add_block_back(const work *w, int64_t j, int far, const desk *d) {
+    const int64_t quarter = w->s->quarter, inner = w->s->extent / 2 + 1, pitch = w->upright * LANES;
+    const REAL sign = far ? -1 : 1;
+    for (int odd = 0; odd < 2; odd++) {
+        for (int n = 0; n < 2; n++) {
+            const REAL *part = (const REAL *)(d->parts[2 * odd + n] + far * BLOCK * w->along);
+            for (int64_t q = 0; q < quarter; q++)
+                for (int r = 0; r < BLOCK; r++) d->turned_parts[q * BLOCK + r] = part[r * w->along * LANES + q];
+            const vec *table = (odd ? &w->sines : &w->cosines)->table_back[n];
+            multiply_block(d->turned_parts, BLOCK, 0, table, w->upright, quarter, w->upright, BLOCK, d->block[n]);
+        }
+        REAL *set[4];
+        for (int n = 0; n < 4; n++) set[n] = (REAL *)(d->sets[n] + j * w->folded) + odd * 2 * inner;
+        for (int64_t m = 0; m < inner; m++)
+            for (int n = 0; n < 2; n++) {
+                const REAL *block = (const REAL *)d->block[m % 2] + m / 2, high = block[n * pitch], low = block[(2 + n) * pitch];
+                set[0][2 * m + n] += high + low, set[1][2 * m + n] += sign * (high + low);
+                set[2][2 * m + n] += sign * (high - low), set[3][2 * m + n] += high - low;
+            }
+    }
 }
 
 // Samples from the parts of their transform: on either side of the middle, and half a period away.
@@ -469,21 +465,21 @@ INLINE void add_up(vec a, vec b, vec c, vec e, vec *x) {
     x[0] = (a + b) + (c + e), x[1] = (a + b) - (c + e), x[2] = (a - b) + (e - c), x[3] = (a - b) - (e - c);
 }
 
-static void add_light(const work *w, REAL weight, const desk *d) {
+// Adds the light of a block's samples at the row j from the middle.
+static void add_light(const work *w, int64_t j, int far, REAL weight, const desk *d) {
     const int64_t half = w->s->samples / 2, vecs = w->along;
-    for (int64_t j = 0; j < half; j++)
-        for (int side = 0; side < 2; side++) {
-            vec *row = d->light + (side ? half - 1 - j : half + j) * 4 * vecs;
-            const int64_t at = (j * BLOCK + 2 * side) * vecs;
-            const vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at;
-            for (int64_t v = 0; v < vecs; v++) {
-                vec re[4], im[4];
-                add_up(a[v], b[v], c[v], e[v], re);
-                add_up(a[vecs + v], b[vecs + v], c[vecs + v], e[vecs + v], im);
+    for (int side = 0; side < 2; side++) {
+        vec *row = d->light + (side ? half - 1 - j : half + j) * 4 * vecs;
+        const int64_t at = (far * BLOCK + 2 * side) * vecs;
+        const vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at;
+        for (int64_t v = 0; v < vecs; v++) {
+            vec re[4], im[4];
+            add_up(a[v], b[v], c[v], e[v], re);
+            add_up(a[vecs + v], b[vecs + v], c[vecs + v], e[vecs + v], im);
 #pragma GCC unroll 4
-                for (int n = 0; n < 4; n++) row[n * vecs + v] += weight * (re[n] * re[n] + im[n] * im[n]);
-            }
+            for (int n = 0; n < 4; n++) row[n * vecs + v] += weight * (re[n] * re[n] + im[n] * im[n]);
         }
+    }
 }
 
 // Where a sample of y stands in a row of light.
@@ -496,11 +492,12 @@ static void sum_pixels(const work *w, const matrix *pixels, const desk *d, REAL 
     const int64_t window = w->s->window;
     for (int64_t v = 0; v < w->s->shifts; v++, out += window * window) {
         multiply(pixels + 4 * v, d->light, 4 * w->along, d->lines);
-        for (int64_t y = 0; y < w->s->samples; y++) {
-            const REAL *line = (const REAL *)d->lines + at_y(w, y);
-            REAL *turned = (REAL *)(d->turned_lines + y * w->beside);
-            for (int64_t p = 0; p < window; p++) turned[p] = line[p * 4 * w->along * LANES];
-        }
+        for (int64_t p = 0; p < w->beside; p++)
+            for (int64_t y = 0; y < w->s->samples; y++) {
+                const REAL *line = (const REAL *)(d->lines + p * LANES * 4 * w->along) + at_y(w, y);
+                REAL *turned = (REAL *)(d->turned_lines + y * w->beside + p);
+                for (int64_t i = 0; i < least(LANES, window - p * LANES); i++) turned[i] = line[i * 4 * w->along * LANES];
+            }
         multiply(pixels + 4 * v + 1, d->turned_lines, w->beside, d->pixels);
         for (int64_t q = 0; q < window; q++) memcpy(out + q * window, d->pixels + q * w->beside, window * sizeof(REAL));
     }
@@ -524,25 +521,51 @@ static void spread_pixels(const work *w, const matrix *pixels, const desk *d, co
     }
 }
 
-// Turns the parts of a state's samples into their gradients, and returns that of the state's weight.
-static REAL light_gradient(const work *w, REAL weight, const desk *d) {
+// Turns the parts of a block's samples into their gradients, and returns that of the state's weight.
+static REAL light_gradient(const work *w, int64_t j, int far, REAL weight, const desk *d) {
     const int64_t half = w->s->samples / 2, vecs = w->along;
     vec total = {0};
-    for (int64_t j = 0; j < half; j++)
-        for (int side = 0; side < 2; side++) {
-            const vec *row = d->of_light + (side ? half - 1 - j : half + j) * 4 * vecs;
-            for (int64_t v = 0; v < 2 * vecs; v++) {  // real parts, then imaginary ones
-                const int64_t at = (j * BLOCK + 2 * side) * vecs + v, y = v < vecs ? v : v - vecs;
-                vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at, x[4], of[4];
-                add_up(*a, *b, *c, *e, x);
+    for (int side = 0; side < 2; side++) {
+        const vec *row = d->of_light + (side ? half - 1 - j : half + j) * 4 * vecs;
+        for (int64_t v = 0; v < 2 * vecs; v++) {  // real parts, then imaginary ones
+            const int64_t at = (far * BLOCK + 2 * side) * vecs + v, y = v < vecs ? v : v - vecs;
+            vec *a = d->parts[0] + at, *b = d->parts[1] + at, *c = d->parts[2] + at, *e = d->parts[3] + at, x[4], of[4];
+            add_up(*a, *b, *c, *e, x);
 #pragma GCC unroll 4
-                for (int n = 0; n < 4; n++) of[n] = row[n * vecs + y] * x[n], total += of[n] * x[n];
-                const vec sum = of[0] + of[1], less = of[0] - of[1], far_sum = of[2] + of[3], far_less = of[2] - of[3];
-                *a = 2 * weight * (sum + far_sum), *b = 2 * weight * (sum - far_sum);
-                *c = 2 * weight * (less - far_less), *e = 2 * weight * (less + far_less);
-            }
+            for (int n = 0; n < 4; n++) of[n] = row[n * vecs + y] * x[n], total += of[n] * x[n];
+            const vec sum = of[0] + of[1], less = of[0] - of[1], far_sum = of[2] + of[3], far_less = of[2] - of[3];
+            *a = 2 * weight * (sum + far_sum), *b = 2 * weight * (sum - far_sum);
+            *c = 2 * weight * (less - far_less), *e = 2 * weight * (less + far_less);
         }
+    }
     return sum_of(total);
+}
+
+// Adds the light of a state, or turns its grid into the gradient and returns that of its weight.
+static REAL transform_state(const work *w, int64_t k, REAL weight, const desk *d) {
+    const int64_t quarter = w->s->quarter, half = w->s->samples / 2, inner = w->s->extent / 2 + 1, vecs = w->folded;
+    const int learning = w->s->gradient != 0;
+    REAL *grid = (REAL *)grid_row(w, d->grids, k * w->s->extent), of_weight = 0;
+    fold(w, grid, d);
+    for (int n = 0; n < 4; n++)
+        multiply_rows((n < 2 ? &w->cosines : &w->sines)->rows + n % 2, d->folded[n / 2] + n % 2 * vecs, 2 * vecs, vecs, d->sets[n]);
+    for (int64_t j = 0; j < quarter; j++) {
+        const int64_t rows[2] = {j, 2 * quarter - 1 - j};
+        const int count = (rows[0] < half) + (rows[1] < half);
+        fill_blocks(w, j, d);
+        transform_blocks(w, count, d);
+        for (int n = 0; n < 4 && learning; n++) memset(d->sets[n] + j * vecs, 0, vecs * sizeof(vec));
+        for (int far = 0; far < count; far++)
+            if (learning) of_weight += light_gradient(w, rows[far], far, weight, d), add_block_back(w, j, far, d);
+            else add_light(w, rows[far], far, weight, d);
+    }
+    for (int n = 0; n < 4 && learning; n++) {
+        multiply((n < 2 ? &w->cosines : &w->sines)->rows_back + n % 2, d->sets[n], vecs, d->rows_back);
+        for (int64_t i = n % 2; i < inner; i += 2)
+            memcpy(d->folded[n / 2] + i * vecs, d->rows_back + i / 2 * vecs, vecs * sizeof(vec));
+    }
+    if (learning) unfold(w, grid, d);
+    return of_weight;
 }
 
 // The gradient of waves, (exposures, states, cells) complex, from those of the grids.
@@ -568,8 +591,8 @@ static void gather_waves(const work *w, const desk *d, REAL *of_waves) {
 static int64_t share_out(const work *w, vec *memory, desk *d) {
     const scattered *s = w->s;
     const int64_t inner = s->extent / 2 + 1, samples = padded(s->samples, BLOCK), folded = inner * w->folded + 1;
-    const int64_t set = padded(s->quarter, BLOCK) * w->folded + 1, block = 2 * s->quarter * w->block / LANES;
-    const int64_t part = s->samples / 2 * BLOCK * w->along;
+    const int64_t set = padded(s->quarter, BLOCK) * w->folded + 1, block = 2 * w->block / LANES;
+    const int64_t part = 2 * BLOCK * w->along;
     const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
                              s->exposures * s->states * s->extent * w->across + 1,
                              w->rows * w->vecs,
@@ -616,12 +639,8 @@ static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves,
         if (s->gradient) spread_pixels(w, pixels, d, s->gradient + out + e * size);
         else memset(d->light, 0, s->samples * 4 * w->along * sizeof(vec));
         for (int64_t k = 0; k < s->states; k++) {
-            transform_state(w, e * s->states + k, d);
-            if (!s->gradient) add_light(w, s->weights[k], d);
-            else {
-                of_weights[k] += light_gradient(w, s->weights[k], d);
-                transform_state_back(w, e * s->states + k, d);
-            }
+            const REAL of_weight = transform_state(w, e * s->states + k, s->weights[k], d);
+            if (s->gradient) of_weights[k] += of_weight;
         }
         if (!s->gradient) sum_pixels(w, pixels, d, s->light + out + e * size);
     }
@@ -648,7 +667,7 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
         fill_weights(w, places);
         for (int64_t v = 0; v < s->exposures * s->shifts; v++) {
             const int64_t at = (place * s->exposures * s->shifts + v) * s->window * s->samples;
-            for (int n = 0; n < 4; n++)
+            for (int n = 0; n < (s->gradient ? 4 : 2); n++)
                 matrices = lay_out(w->pixels + 4 * v + n, (n % 2 ? s->rows : s->columns) + at, n < 2 ? s->window : s->samples,
                                    n < 2 ? s->samples : s->window, n >= 2, matrices);
         }
