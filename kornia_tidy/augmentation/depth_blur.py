@@ -161,8 +161,7 @@ def _warn_of_unit(depth: Tensor, f_number: float | Tensor, focal_length: float, 
     ends = torch.stack(torch.aminmax(depth)).float().cpu()
     fastest = f_number.min().cpu() if isinstance(f_number, Tensor) else f_number
     if blur_radius(ends[0], math.inf, fastest, focal_length, pixel_pitch) < _SHARP:
-        usual = ThinLensCamera()
-        said = misread_depth(usual, *usual.defocus(ends.flip(0)))
+        said = misread_depth(ThinLensCamera(), *ends.tolist())
         if said is not None:
             warn_once(None, "unit of depth in depth_blur", said, stacklevel=4)
 

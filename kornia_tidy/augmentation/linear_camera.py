@@ -76,7 +76,7 @@ class LinearCamera(nn.Module):
             depth, valid = fill_holes(depth)
         self.register_buffer("depth", depth, persistent=False)
         self.register_buffer("valid", valid, persistent=False)
-        check_defocus(optics.camera.defocus(depth, optics.check_inputs), optics)  # raises, and warns
+        check_defocus(depth, optics)  # raises, and warns
         if field_center is not None and len(depth) > 1:
             check_centers(field_center, len(depth))  # raises; with one depth, places are checked on use
 

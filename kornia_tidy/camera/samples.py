@@ -18,7 +18,7 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.precision import widest
 from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.optics.misread_depth import misread_depth
+from kornia_tidy.optics.misread_depth import OTHER_FOCUS, misread_depth
 from kornia_tidy.optics.thin_lens import DefocusRange
 from kornia_tidy.optics.units import SAME_FOCUS, check_depth_fits, check_image, layout_remedy, warn_once
 from kornia_tidy.psf.field import check_centers
@@ -28,6 +28,7 @@ from kornia_tidy.render.borders import cropped
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
+_UNIT = "unit of depth"
 
 
 @dataclass(eq=False)
@@ -250,12 +251,13 @@ def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
     return sample["image"], sample[keys[0]]
 
 
-def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera) -> Tensor:
+def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera, depth: Tensor) -> Tensor:
     """Return how far the defocus of a scene reaches; note and, once, tell of pixels beyond the camera's range.
 
     Args:
         parts: of the defocus map, in radians.
         camera: its range of defocus.
+        depth: of the scene, for a warning.
 
     Returns:
         Lowest and highest defocus in radians, (2,); the map itself where it is learnt or cannot be looked at; the range
@@ -280,8 +282,12 @@ def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera) -> Tensor:
         extremes = torch.stack([lowest, highest])
         pixels += own.numel()
     camera.notes.clamped = clamped
-    if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + SAME_FOCUS):
-        warn_of_defocus(extremes, camera, pixels, int(clamped))
+    if (
+        camera.check_inputs
+        and pixels
+        and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + max(SAME_FOCUS, -lo / OTHER_FOCUS))
+    ):
+        warn_of_defocus(depth, camera, extremes, int(clamped))
     if fixed is not None:
         return torch.tensor(fixed, requires_grad=reach is not None and reach.requires_grad)
     return extremes if reach is None else reach
@@ -324,36 +330,43 @@ def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, 
         if not (near > 0 and (far <= 1 or not isinstance(lens, DefocusRange))):
             lens.defocus(depth)
         beyond = reach[0] < lo - ROUNDING or reach[1] > hi + ROUNDING
-        if beyond or reach[1] <= lo + SAME_FOCUS:
-            warn_of_defocus(torch.tensor(reach), camera, own.numel(), int(camera.notes.clamped) if beyond else 0)
+        if beyond or reach[1] <= lo + max(SAME_FOCUS, -lo / OTHER_FOCUS):
+            warn_of_defocus(depth, camera, torch.tensor(reach), int(camera.notes.clamped) if beyond else 0)
     return torch.tensor(reach, requires_grad=defocus.requires_grad)
 
 
-def check_defocus(defocus: Tensor, camera: CheckedCamera) -> None:
-    """Warn once of depths in another unit or beyond the camera's range, from their defocus."""
+def check_defocus(depth: Tensor, camera: CheckedCamera) -> Tensor:
+    """Return the defocus of a depth map in radians; warn once of a map in another unit."""
+    defocus = camera.psf_model.camera.defocus(depth, camera.check_inputs)
     if camera.check_inputs and defocus.numel() and Mode.GRAPH not in torch_mode():
-        warn_of_defocus(torch.stack(torch.aminmax(defocus.detach())), camera)
+        warn_of_defocus(depth, camera)
+    return defocus
 
 
-def warn_of_defocus(extremes: Tensor, camera: CheckedCamera, pixels: int = 0, clamped: int = 0) -> None:
+def warn_of_defocus(depth: Tensor, camera: CheckedCamera, extremes: Tensor | None = None, clamped: int = 0) -> None:
     """Warn once of depths in another unit, or else of those beyond the camera's range.
 
     Args:
-        extremes: lowest and highest defocus in radians, (2,).
+        depth: of the scene.
         camera: its range of defocus, and its earlier warnings.
-        pixels: number of all pixels.
-        clamped: number of those beyond the range.
+        extremes: lowest and highest defocus in radians, (2,); None: not looked at.
+        clamped: number of pixels beyond the range.
     """
-    lens = camera.psf_model.camera
-    said = misread_depth(lens, *extremes)
-    if said is not None:
-        warn_once(camera.notes.told, "depth", said, stacklevel=8)
-    elif clamped:
-        (lo, hi), (lowest, highest) = lens.defocus_range, extremes.tolist()
+    lens, told = camera.psf_model.camera, camera.notes.told
+    lo, hi = lens.defocus_range
+    lowest, highest = (math.inf, -math.inf) if extremes is None else extremes.tolist()
+    if _UNIT in told:
+        return
+    if not clamped or lowest > hi or highest < lo:
+        said = misread_depth(lens, *(float(end) for end in torch.aminmax(depth.detach())))
+        if said is not None:
+            warn_once(told, _UNIT, said, stacklevel=8)
+            return
+    if clamped:
         warn_once(
-            camera.notes.told,
+            told,
             "depths beyond the camera's range",
-            f"{clamped} of {pixels} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
+            f"{clamped} of {depth.numel()} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
             f"the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
             f"ThinLensCamera.for_scene, or its depth_range)",
             stacklevel=8,

@@ -478,7 +478,7 @@ class TiDyOptics(nn.Module):
             reach = (
                 defocus_extremes_in_one_read(image, depth, defocus, self)
                 if unread
-                else defocus_extremes([defocus], self)
+                else defocus_extremes([defocus], self, depth)
             )
             yield Strip(light, defocus, reach, self.border, fields=fields)
             return
@@ -487,7 +487,7 @@ class TiDyOptics(nn.Module):
             check_light(sample.image, self)
         parts = sample.depth.split(rows, dim=-2)
         to_defocus = partial(self.psf_model.camera.defocus, check_inputs=self.check_inputs)
-        reach = defocus_extremes((to_defocus(part.to(sample.dtype)) for part in parts), self)
+        reach = defocus_extremes((to_defocus(part.to(sample.dtype)) for part in parts), self, sample.depth)
         given = rows, self.height(sample), self.window // 2, self.border, fields
         for own, image, depth, places in strips_of(sample, *given):
             yield Strip(decode(image, self.color_space), to_defocus(depth), reach, "valid", own, places)
@@ -591,8 +591,7 @@ class TiDyOptics(nn.Module):
             raise ValueError(f"a plan needs at least one image and its depth, got {found}")
         light = None if image is None else self.decode(sample.image.to(sample.dtype))
         metres = sample.depth.to(compute_dtype(depth.dtype, self.fidelity, depth.device))
-        defocus = self.camera.defocus(metres, self.check_inputs)
-        check_defocus(defocus, self)
+        defocus = check_defocus(metres, self)
         return plan_scene(self, defocus, light, (len(sample.image), sample.image.shape[1]), tolerance)
 
     @torch.no_grad()
@@ -619,7 +618,7 @@ class TiDyOptics(nn.Module):
             raise ValueError("an explanation needs at least one image, got a batch of none")
         light = self.decode(sample.image.to(sample.dtype))
         defocus = self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs)
-        reach, (batch, channels, height, width) = defocus_extremes([defocus], self), light.shape
+        reach, (batch, channels, height, width) = defocus_extremes([defocus], self, sample.depth), light.shape
         center = sample.centers[0] if sample.centers else self.field_center
         field = self.psf_model.field_of((height, width), center)
         given = self.compositing, self.memory_budget, defocus, light.device, field
@@ -673,7 +672,7 @@ class TiDyOptics(nn.Module):
     def check_scene(self, image: Tensor, depth: Tensor) -> None:
         """Check the values of an image and its depth as a capture does, and warn of other units."""
         sample = read_sample(image, depth, self)
-        check_defocus(self.camera.defocus(sample.depth.to(sample.dtype), self.check_inputs), self)
+        check_defocus(sample.depth.to(sample.dtype), self)
 
     def extra_repr(self) -> str:
         """Describe the camera in a person's words."""

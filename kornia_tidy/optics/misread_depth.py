@@ -2,42 +2,53 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import math
 
 from kornia_tidy.arrays import FARTHEST
-from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
-from kornia_tidy.optics.units import SAME_FOCUS, like_infinity, misread_metres
+from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera, number_of
+from kornia_tidy.optics.units import KILOMETRES, UNITS, like_infinity
+
+OTHER_FOCUS = 100.0  # times the focus distance or a part of it; a scene that is all beyond is probably in another unit
 
 
-def misread_depth(camera: ThinLensCamera | DefocusRange, lowest: Tensor, highest: Tensor) -> str | None:
-    """Return a warning if depths are probably in millimetres or centimetres instead of metres.
+def misread_depth(camera: ThinLensCamera | DefocusRange, nearest: float, farthest: float) -> str | None:
+    """Return a warning if depths are probably in another unit than metres.
 
-    Three conditions must hold. The nearest pixel is so far that its focus equals that of infinity or of the far end of
-    the camera's range. No pixel is at infinity, as sky is. In the other unit the nearest depth lies in the camera's
-    range.
+    It is one of these. The nearest pixel is so far that its focus equals that of infinity, or beyond the camera's range
+    or a hundred focus distances, and none is beyond 100 km, as sky is. All are beyond 100 km, and not all at infinity.
+    The farthest pixel is within a hundredth of the focus distance. In the other unit the camera's range has the scene.
 
     Args:
-        camera: converts depth to defocus.
-        lowest: defocus of the farthest pixel in radians.
-        highest: defocus of the nearest pixel in radians.
+        camera: that the map is for.
+        nearest: least depth of the map.
+        farthest: greatest depth of the map.
 
     Returns:
         The warning, or None.
 
     Example:
-        >>> import torch
-        >>> camera = ThinLensCamera()
-        >>> misread_depth(camera, *camera.defocus(torch.tensor([1500.0, 700.0])))
-        'the nearest pixel is 700 m away, and this camera sees no difference beyond 23.8 m: are these \
-millimetres? Multiply depth by 0.001 (on the command line: --depth-scale 0.001)'
-        >>> misread_depth(camera, *camera.defocus(torch.tensor([1.5, 0.7]))) is None
+        >>> misread_depth(ThinLensCamera(), 700, 1500)
+        'the nearest pixel is 700 m away, and this camera is focused at 0.595 m: are these millimetres? Multiply depth \
+by 0.001 (on the command line: --depth-scale 0.001)'
+        >>> misread_depth(ThinLensCamera(), 0.7, 1.5) is None
         True
     """
-    if float(highest) > camera.defocus_range[0] + SAME_FOCUS or isinstance(camera, DefocusRange):
-        return None
-    nearest, farthest = (float(camera.depth(psi).detach()) for psi in (highest, lowest))
-    if farthest > FARTHEST:
+    if isinstance(camera, DefocusRange):
         return None
     first, last = camera.depth_range
-    remedy = "depth by {0:g} (on the command line: --depth-scale {0:g})"
-    return misread_metres("the nearest pixel", nearest, first, min(last, like_infinity(camera.aperture_radius)), remedy)
+    focus = number_of(camera.focus_distance)
+    last = min(last, like_infinity(camera.aperture_radius), OTHER_FOCUS * focus)
+    sky = FARTHEST < nearest < math.inf
+    if sky or last < nearest <= farthest <= FARTHEST:
+        which, away, units = "nearest", nearest, UNITS
+    elif farthest < min(focus, 2 * first) / OTHER_FOCUS:
+        which, away, units = "farthest", farthest, (KILOMETRES,)
+    else:
+        return None
+    factor, unit = next((unit for unit in units if first / 4 <= away * unit[0] <= last), (0.0, ""))
+    remedies = [f"are these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"]
+    remedies = remedies[not unit :] + ["give a sky as infinity"] * sky
+    if not remedies:
+        return None
+    said = f"the {which} pixel is {away:.4g} m away, and this camera is focused at {focus:.4g} m: "
+    return said + "; ".join(remedies)

@@ -70,7 +70,7 @@ def check_lens(focal_length: float, focus_distance: float | Tensor, f_number: fl
     check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
     check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
     check_number("focus_distance", focus_distance, "metres")
-    if not (focus := _number(focus_distance)) > focal_length:
+    if not (focus := number_of(focus_distance)) > focal_length:
         raise ValueError(f"focus_distance must be beyond the focal length {focal_length} m, got {focus}")
     if f_number is not None:
         check_positive("f_number", f_number)
@@ -78,7 +78,8 @@ def check_lens(focal_length: float, focus_distance: float | Tensor, f_number: fl
             raise ValueError(f"f_number must be at least {FASTEST}, the limit of a lens in air, got {f_number}")
 
 
-def _number(value: float | Tensor) -> float:
+def number_of(value: float | Tensor) -> float:
+    """Return a number that may be learnt."""
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 
@@ -162,7 +163,7 @@ class ThinLensCamera(nn.Module):
         self.aperture_diameter = aperture_diameter
         self.pixel_pitch = pixel_pitch
         self.lens_material = lens_material
-        self.focus_distance: float | Tensor = (focus := _number(focus_distance))
+        self.focus_distance: float | Tensor = (focus := number_of(focus_distance))
         if isinstance(focus_distance, Tensor):
             del self.focus_distance  # a parameter may not shadow an attribute
             self.focus_distance = nn.Parameter(focus_distance.detach().clone())
@@ -338,7 +339,7 @@ class ThinLensCamera(nn.Module):
         near, far = self.depth_range
         lo, hi = self.defocus_range
         return (
-            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {_number(self.focus_distance):.4g} m, "
+            f"{self.focal_length * 1e3:g} mm f/{self.f_number:.3g}, focus at {number_of(self.focus_distance):.4g} m, "
             f"pixels of {self.pixel_pitch * 1e6:.3g} um, depths {near:.4g} to {far:.4g} m (psi {hi:+.2f} to {lo:+.2f})"
             f"{'' if self.lens_material is None else ', a single element of ' + self.lens_material.name}"
         )

@@ -9,8 +9,6 @@ from collections.abc import Hashable, Sequence
 import torch
 from torch import Tensor
 
-from kornia_tidy.arrays import FARTHEST
-
 # Noise and interpolation go a little beyond [0, 1], and no encoding of highlights goes above 2.39 (scRGB).
 # An image normalised by ImageNet's statistics spans -2.12 to 2.64, and an 8-bit image reaches 255.
 BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
@@ -18,7 +16,8 @@ DARKEST_LIGHT = -1.0  # out-of-gamut colours are negative in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
 SAME_FOCUS = 0.5  # rad; lowers the peak of a PSF by only 2 % (1 - psi^2 / 12), so two depths look equally sharp
 LEAST_MILLIMETRES = 100.0  # m; to this distance a setting is taken for metres, as few lenses focus at 100 mm
-UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"))
+UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e-6, "micrometres"), (1e-9, "nanometres"))
+KILOMETRES = (1e3, "kilometres")
 
 _TOLD: set[Hashable] = set()  # warnings that were given in this process
 
@@ -111,37 +110,27 @@ def like_infinity(aperture_radius: float) -> float:
     return math.pi * aperture_radius**2 / 530e-9 / SAME_FOCUS
 
 
-def misread_metres(name: str, metres: float, first: float, last: float, remedy: str) -> str | None:
-    """Return a warning if a depth lies where a camera sees no difference any more, but not if it were millimetres.
+def warn_of_metres(names: Sequence[str], metres: Sequence[float], first: float, last: float) -> None:
+    """Warn once of the first of some distances at which a camera sees no difference any more, and would in another unit.
 
     Args:
-        name: what is so far away.
-        metres: its distance. Infinity and those beyond 100 km, as of sky, give no warning.
-        first: nearest depth that is plausible, in metres.
-        last: depth in metres beyond which the camera sees no difference.
-        remedy: what to multiply, with a place for the factor.
+        names: of the distances.
+        metres: the distances; infinity gives no warning.
+        first: nearest distance that is plausible, in metres.
+        last: distance in metres beyond which the camera sees no difference.
 
     Example:
-        >>> misread_metres("focus_distance", 595.0, 0.05, 24.0, "it by {:g}")
-        'focus_distance is 595 m away, and this camera sees no difference beyond 24 m: are these millimetres? \
-Multiply it by 0.001'
+        >>> warn_of_metres(["focus_distance"], [0.595], 0.05, 24.0)
     """
-    if not last < metres <= FARTHEST:
-        return None
-    for factor, unit in UNITS:
-        if first <= metres * factor <= last:
-            return (
-                f"{name} is {metres:.4g} m away, and this camera sees no difference beyond {last:.3g} m: are these "
-                f"{unit}? Multiply {remedy.format(factor)}"
-            )
-    return None
-
-
-def warn_of_metres(names: Sequence[str], metres: Sequence[float], first: float, last: float) -> None:
-    """Warn once of the first of some distances that :func:`misread_metres` takes for millimetres."""
     last = max(last, LEAST_MILLIMETRES)
     for name, far in zip(names, metres, strict=True):
-        if said := misread_metres(name, far, first, last, "it by {:g}"):
+        likely = [unit for unit in UNITS if first <= far * unit[0] <= last]
+        if last < far < math.inf and likely:
+            factor, unit = likely[0]
+            said = (
+                f"{name} is {far:.4g} m away, and this camera sees no difference beyond {last:.3g} m: are these "
+                f"{unit}? Multiply it by {factor:g}, or give inf"
+            )
             warn_once(None, ("metres", name), said, stacklevel=4)
             return
 

@@ -15,7 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from kornia_tidy import DefocusRange, Fidelity, PSFBank, SensorNoise, ThinLensCamera, TiDyOptics, burst, moving_capture
+from kornia_tidy import (
+    DefocusRange,
+    Fidelity,
+    NoMask,
+    PSFBank,
+    SensorNoise,
+    ThinLensCamera,
+    TiDyOptics,
+    burst,
+    moving_capture,
+)
 from kornia_tidy.arrays import depth_tensor
 from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur
 from kornia_tidy.cli import main
@@ -49,9 +59,12 @@ class TestDepth(BaseTester):
     @pytest.mark.parametrize(
         ("near", "far", "said"),
         [
-            (700, 1500, "700 m away, .* beyond 23.8 m: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
+            (700, 1500, "700 m away, .* focused at 0.595 m: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
             (500, 65535, "are these millimetres"),
             (70, 150, "70 m away, .*: are these centimetres.* by 0.01 .*--depth-scale 0.01"),
+            (5e5, 3e6, "are these micrometres.* by 1e-06 .*; give a sky as infinity"),
+            (5e8, INF, "are these nanometres"),  # holes are often infinite
+            (5e-4, 3e-3, "farthest pixel is 0.003 m away, .*: are these kilometres.* by 1000"),
         ],
     )
     def test_feature_other_units_are_told_once(self, near, far, said, device, dtype):
@@ -64,9 +77,15 @@ class TestDepth(BaseTester):
 
     def test_feature_all_beyond_a_camera_s_range_are_told_by_their_unit(self):
         optics = camera(camera=ThinLensCamera.for_scene((0.5, 4.0)))
-        with pytest.warns(UserWarning, match=r"no difference beyond 4 m: are these millimetres") as told:
+        with pytest.warns(UserWarning, match="900 m away.*are these millimetres") as told:
             optics(*scene(900.0))
         assert len(told) == 1
+
+    def test_feature_a_fast_lens_sees_millimetres_apart_and_they_are_told(self):
+        optics = camera(masks=NoMask(), camera=ThinLensCamera(f_number=1.8, focus_distance=2.0), border="replicate")
+        with pytest.warns(UserWarning, match="400 m away, .* focused at 2 m: are these millimetres"):
+            optics.check_scene(*scene(400.0))
+        optics.check_scene(*scene(150.0))  # warnings are errors
 
     @pytest.mark.parametrize(
         ("depths", "options"),
@@ -75,6 +94,7 @@ class TestDepth(BaseTester):
             ((2.0, 400.0), {}),  # a street
             ((30.0, INF), {}),  # a landscape under a sky
             ((INF, INF), {}),
+            ((0.5, 1e10), {}),  # as Blender writes infinity
             ((60.0, 2000.0), {"camera": ThinLensCamera(0.3, 0.1, 100.0, depth_range=(50.0, INF))}),  # a telephoto lens
             ((3.9, 4.0), {"camera": ThinLensCamera.for_scene((0.5, 4.0))}),
             ((0.0, 1.0), {"camera": DefocusRange()}),
@@ -100,6 +120,10 @@ class TestDepth(BaseTester):
             (
                 lambda: ThinLensCamera(focus_distance=595),
                 "focus_distance is 595 m away, .*: are these mill",
+            ),
+            (
+                lambda: ThinLensCamera(focus_distance=5.95e5),
+                r"are these micrometres\? Multiply it by 1e-06, or give inf",
             ),
             (lambda: ThinLensCamera(depth_range=(300, 5000)), "depth_range is 300 m away.*: are these millimetres"),
             (lambda: RandomDepthBlur((500, 5000)), r"focus_distance is 500 m away.*millimetres\? Multiply it by 0.001"),
