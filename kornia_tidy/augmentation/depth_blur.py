@@ -155,12 +155,13 @@ def depth_blur(
 
 
 def _warn_of_unit(depth: Tensor, f_number: float | Tensor, focal_length: float, pixel_pitch: float) -> None:
-    """Warn once of depths that are as sharp as infinity, and that the default camera takes for millimetres."""
+    """Warn once of depths as sharp as infinity, or in the lens, that the default camera takes for another unit."""
     if not depth.numel():
         return
     ends = torch.stack(torch.aminmax(depth)).float().cpu()
     fastest = f_number.min().cpu() if isinstance(f_number, Tensor) else f_number
-    if blur_radius(ends[0], math.inf, fastest, focal_length, pixel_pitch) < _SHARP:
+    far = blur_radius(ends[0], math.inf, fastest, focal_length, pixel_pitch) < _SHARP
+    if far or ends[1] < focal_length:
         said = misread_depth(ThinLensCamera(), *ends.tolist())
         if said is not None:
             warn_once(None, "unit of depth in depth_blur", said, stacklevel=4)

@@ -18,9 +18,9 @@ from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.precision import widest
 from kornia_tidy.mode import Mode, refuse_torchscript, torch_mode
 from kornia_tidy.optics.holes import fill_holes
-from kornia_tidy.optics.misread_depth import OTHER_FOCUS, misread_depth
+from kornia_tidy.optics.misread_depth import misread_depth
 from kornia_tidy.optics.thin_lens import DefocusRange
-from kornia_tidy.optics.units import SAME_FOCUS, check_depth_fits, check_image, layout_remedy, warn_once
+from kornia_tidy.optics.units import OTHER_FOCUS, SAME_FOCUS, check_depth_fits, check_image, layout_remedy, warn_once
 from kornia_tidy.psf.field import check_centers
 from kornia_tidy.psf.psf_model import PSFModel
 from kornia_tidy.render.borders import cropped

@@ -10,8 +10,12 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_count, check_positive, unmasked
+from kornia_tidy.optics.units import warn_once
 
 WIDEST_CROSSTALK = 1000  # pixels, standard deviation; wider than any panel
+_NO_CROSSTALK = 1e-3  # pixels; metres are fewer
+SHORT = 3.0  # rad; a smaller span is not a whole wave, and in units of pi panels have it
+_WIDEST = 4 * math.pi  # rad; no panel has a longer stroke
 _SLACK = 1e-3  # rad beyond 0 to 4 pi, by rounding in a file
 
 
@@ -26,7 +30,7 @@ def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
         (2^b,) radians, float64.
 
     Raises:
-        ValueError: if bits or range are out of range.
+        ValueError: if bits are out of range, or the range is not positive or above 4π, as in degrees.
 
     Example:
         >>> level_phases(2) / math.pi
@@ -34,6 +38,8 @@ def level_phases(bits: int, phase_range: float = 2 * math.pi) -> Tensor:
     """
     check_count("bits", bits, most=10)
     check_positive("phase_range", phase_range, "radians")
+    if phase_range > _WIDEST + _SLACK:
+        raise ValueError(f"phase_range must be at most 4 pi radians, got {phase_range:g}: multiply degrees by pi / 180")
     return torch.arange(2**bits, dtype=torch.float64) * (phase_range / 2**bits)
 
 
@@ -68,7 +74,7 @@ and do not give drive values for phases
             f"a measured response must have {2**bits} phases, one for each level of {bits} bits, got {got}"
         )
     steps = curve.diff() * (1 if curve[-1] >= curve[0] else -1)
-    outside = ~((curve >= -_SLACK) & (curve <= 4 * math.pi + _SLACK))  # True for NaN
+    outside = ~((curve >= -_SLACK) & (curve <= _WIDEST + _SLACK))  # True for NaN
     back = torch.cat([steps.new_zeros(1, dtype=torch.bool), steps < 0])
     level = int((outside if bool(outside.any()) else back).long().argmax())
     got = f"got {float(curve[level]):.6g} at level {level}" + (f" (line {lines[level]})" if lines else "")
@@ -85,6 +91,18 @@ and do not give drive values for phases
     if curve[-1] == curve[0]:
         raise ValueError(f"a measured response must rise or fall, got {float(curve[0]):.6g} at every level")
     return curve
+
+
+def tell_short_span(span: float, bits: int, sentence: str) -> None:
+    """Warn, once for each span, of a response that spans much less than a wave, as one in units of waves or pi does.
+
+    Args:
+        span: of its phases in radians.
+        bits: of its panel.
+        sentence: text of the warning.
+    """
+    if span < SHORT and bits > 1:
+        warn_once(None, ("span of a response", span), sentence, stacklevel=4)
 
 
 def nearest_level(phase: Tensor, levels: Tensor) -> Tensor:
@@ -175,6 +193,8 @@ class GreyLevels(nn.Module):
         levels = level_phases(bits, phase_range)
         if response is not None:
             levels = check_response(response, bits)
+            span = float(levels.max() - levels.min())
+            tell_short_span(span, bits, f"a response spans {span:.3g} rad: multiply waves by 2 pi, degrees by pi / 180")
             self.response = tuple(levels.tolist())
         # Not a buffer, because module.to(float16) must not round the phases of the panel.
         self.levels = levels
@@ -250,6 +270,10 @@ def crosstalk_kernel(sigma: float) -> Tensor:
     check_positive("sigma", sigma, "pixels")
     if sigma > WIDEST_CROSSTALK:
         raise ValueError(f"sigma must be at most {WIDEST_CROSSTALK} pixels, got {sigma}")
+    if sigma < _NO_CROSSTALK:
+        warn_once(
+            None, "sigma of crosstalk", f"sigma is {sigma:g} pixels, as if none: divide metres by the pixel pitch"
+        )
     reach = math.ceil(6 * sigma)
     x = torch.arange(-reach - 1, reach + 2, dtype=torch.float64)
     integral = x * torch.special.ndtr(x / sigma) + sigma / math.sqrt(2 * math.pi) * torch.exp(-((x / sigma) ** 2) / 2)

@@ -106,7 +106,7 @@ def cauchy_through(name: str, source: str, indices: tuple[tuple[float, float], .
         A material that is valid between the shortest and the longest of these wavelengths.
 
     Raises:
-        ValueError: if there are fewer than two indices, or a wavelength is repeated.
+        ValueError: if there are fewer than two indices, a wavelength is repeated, or one is not in metres.
 
     Source: Cauchy (1836); Born and Wolf, Principles of Optics, section 2.3.4.
 
@@ -115,6 +115,8 @@ def cauchy_through(name: str, source: str, indices: tuple[tuple[float, float], .
         >>> round(glass.index(450e-9), 6), round(glass.index(550e-9), 4)
         (1.53, 1.5173)
     """
+    for wavelength, _ in indices:
+        check_wavelength("wavelength", wavelength)
     waves = [wavelength * 1e6 for wavelength, _ in indices]
     if len(indices) < 2 or len(set(waves)) < len(waves):
         raise ValueError(f"indices must be known at two or more different wavelengths, got {indices}")

@@ -6,9 +6,7 @@ import math
 
 from kornia_tidy.arrays import FARTHEST
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera, number_of
-from kornia_tidy.optics.units import KILOMETRES, UNITS, like_infinity
-
-OTHER_FOCUS = 100.0  # times the focus distance or a part of it; a scene that is all beyond is probably in another unit
+from kornia_tidy.optics.units import KILOMETRES, OTHER_FOCUS, UNITS, like_infinity
 
 
 def misread_depth(camera: ThinLensCamera | DefocusRange, nearest: float, farthest: float) -> str | None:
@@ -28,8 +26,8 @@ def misread_depth(camera: ThinLensCamera | DefocusRange, nearest: float, farthes
 
     Example:
         >>> misread_depth(ThinLensCamera(), 700, 1500)
-        'the nearest pixel is 700 m away, and this camera is focused at 0.595 m: are these millimetres? Multiply depth \
-by 0.001 (on the command line: --depth-scale 0.001)'
+        "the nearest pixel is 700 m away, far from the camera's focus: are these millimetres? Multiply depth by 0.001 \
+(on the command line: --depth-scale 0.001)"
         >>> misread_depth(ThinLensCamera(), 0.7, 1.5) is None
         True
     """
@@ -50,5 +48,4 @@ by 0.001 (on the command line: --depth-scale 0.001)'
     remedies = remedies[not unit :] + ["give a sky as infinity"] * sky
     if not remedies:
         return None
-    said = f"the {which} pixel is {away:.4g} m away, and this camera is focused at {focus:.4g} m: "
-    return said + "; ".join(remedies)
+    return f"the {which} pixel is {away:.4g} m away, far from the camera's focus: {'; '.join(remedies)}"

@@ -13,11 +13,12 @@ from kornia_tidy.checks import check_depth, check_metres, check_number, check_pa
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.optics.materials import Material
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, check_wavelength
-from kornia_tidy.optics.units import like_infinity, warn_of_metres
+from kornia_tidy.optics.units import OTHER_FOCUS, like_infinity, warn_of_metres, warn_once
 
 FASTEST = 0.5  # f-number at a numerical aperture of 1, the limit of a lens in air
 # Limits in metres: from microscope objectives to telescopes, and from the smallest pixels to those of thermal cameras.
 FOCAL_LENGTHS, DIAMETERS, PITCHES = (1e-5, 10.0), (1e-6, 10.0), (1e-7, 1e-3)
+LONG = 1.2  # metres; few lenses have a longer focal length, and those of telephones have as many millimetres
 NEAREST_DEPTH = 1e-18  # metres
 _LENGTHS = ("focal_length", "aperture_diameter", "focus_distance", "pixel_pitch", "depth_range", "lens_material")
 DEFAULT_DIAMETER = 2.835e-3  # metres; psi of the paper's range at the default focus
@@ -68,6 +69,10 @@ def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
 def check_lens(focal_length: float, focus_distance: float | Tensor, f_number: float | None, pixel_pitch: float) -> None:
     """Raise ``ValueError`` unless a lens of these lengths and of this f-number can be made."""
     check_metres("focal_length", focal_length, *FOCAL_LENGTHS, "50 mm is 50e-3")
+    if focal_length > LONG:
+        warn_once(
+            None, "focal_length", f"focal_length is {focal_length:g} m: if these are millimetres, multiply by 0.001"
+        )
     check_metres("pixel_pitch", pixel_pitch, *PITCHES, "8 um is 8e-6")
     check_number("focus_distance", focus_distance, "metres")
     if not (focus := number_of(focus_distance)) > focal_length:
@@ -171,8 +176,10 @@ class ThinLensCamera(nn.Module):
             raise ValueError("a camera focused at infinity needs depth_range=(near, far) in metres, got None")
         near, far = _depth_range(depth_range) if depth_range is not None else (focus / 2, math.inf)
         self.depth_range = (near, far)
-        names, farthest = ("focus_distance", "depth_range"), like_infinity(self.aperture_radius)
-        warn_of_metres(names, (focus, near), focal_length, farthest)
+        hyperfocal = focal_length * aperture_diameter / pixel_pitch  # infinity is within a pixel
+        farthest = min(like_infinity(self.aperture_radius), hyperfocal)
+        warn_of_metres(["focus_distance"], [focus], focal_length, farthest)
+        warn_of_metres(["depth_range"], [near], focal_length, min(farthest, OTHER_FOCUS * focus))
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
         # Plain numbers, so that the defocus nodes of a PSF bank do not move with a learnable focus.
         self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))

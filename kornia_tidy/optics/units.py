@@ -15,6 +15,7 @@ BRIGHTEST_CODE, NONSENSE_CODE, DARKEST_CODE = 2.5, 16.0, -0.5
 DARKEST_LIGHT = -1.0  # out-of-gamut colours are negative in linear light
 LARGEST_LIGHT = 1e30  # sums over a PSF and over a tile stay finite in float32
 SAME_FOCUS = 0.5  # rad; lowers the peak of a PSF by only 2 % (1 - psi^2 / 12), so two depths look equally sharp
+OTHER_FOCUS = 100.0  # times the focus distance or a part of it; a scene that is all beyond is probably in another unit
 LEAST_MILLIMETRES = 100.0  # m; to this distance a setting is taken for metres, as few lenses focus at 100 mm
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e-6, "micrometres"), (1e-9, "nanometres"))
 KILOMETRES = (1e3, "kilometres")
@@ -111,7 +112,7 @@ def like_infinity(aperture_radius: float) -> float:
 
 
 def warn_of_metres(names: Sequence[str], metres: Sequence[float], first: float, last: float) -> None:
-    """Warn once of the first of some distances at which a camera sees no difference any more, and would in another unit.
+    """Warn once of the first of some distances that a camera sees as infinity, and would not in another unit.
 
     Args:
         names: of the distances.

@@ -27,14 +27,22 @@ from kornia_tidy import (
     moving_capture,
 )
 from kornia_tidy.arrays import depth_tensor
-from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur
+from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur, depth_blur
 from kornia_tidy.cli import main
 from kornia_tidy.data import read_depth, write_depth
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.lab.calibration.psf import diffraction_cutoff
 from kornia_tidy.lab.mask_export import frame_times
 from kornia_tidy.masks import PixelwiseMask, ZernikeMask, initial_heights
-from kornia_tidy.modulator import DwellTimes, LearnableDwellTimes, SpatialLightModulator, Switching
+from kornia_tidy.modulator import (
+    DwellTimes,
+    GreyLevels,
+    LearnableDwellTimes,
+    PixelCrosstalk,
+    SpatialLightModulator,
+    Switching,
+)
+from kornia_tidy.optics import cauchy_through
 from kornia_tidy.reconstruction import PhaseCam3DUNet
 from kornia_tidy.reconstruction.trained import check_weights
 from kornia_tidy.sensor import full_well_of
@@ -59,7 +67,7 @@ class TestDepth(BaseTester):
     @pytest.mark.parametrize(
         ("near", "far", "said"),
         [
-            (700, 1500, "700 m away, .* focused at 0.595 m: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
+            (700, 1500, "700 m away, .*: are these millimetres.* by 0.001 .*--depth-scale 0.001"),
             (500, 65535, "are these millimetres"),
             (70, 150, "70 m away, .*: are these centimetres.* by 0.01 .*--depth-scale 0.01"),
             (5e5, 3e6, "are these micrometres.* by 1e-06 .*; give a sky as infinity"),
@@ -83,7 +91,7 @@ class TestDepth(BaseTester):
 
     def test_feature_a_fast_lens_sees_millimetres_apart_and_they_are_told(self):
         optics = camera(masks=NoMask(), camera=ThinLensCamera(f_number=1.8, focus_distance=2.0), border="replicate")
-        with pytest.warns(UserWarning, match="400 m away, .* focused at 2 m: are these millimetres"):
+        with pytest.warns(UserWarning, match="400 m away, .*: are these millimetres"):
             optics.check_scene(*scene(400.0))
         optics.check_scene(*scene(150.0))  # warnings are errors
 
@@ -125,6 +133,9 @@ class TestDepth(BaseTester):
                 lambda: ThinLensCamera(focus_distance=5.95e5),
                 r"are these micrometres\? Multiply it by 1e-06, or give inf",
             ),
+            (lambda: ThinLensCamera(f_number=1.8, focus_distance=2000), "focus_distance is 2000 m away.*millimetres"),
+            (lambda: ThinLensCamera(f_number=1.8, depth_range=(300, 5000)), "depth_range is 300 m away.*millimetres"),
+            (lambda: ThinLensCamera(4.2, f_number=1.8, focus_distance=8), "focal_length is 4.2 m: if .* millimetres"),
             (lambda: ThinLensCamera(depth_range=(300, 5000)), "depth_range is 300 m away.*: are these millimetres"),
             (lambda: RandomDepthBlur((500, 5000)), r"focus_distance is 500 m away.*millimetres\? Multiply it by 0.001"),
             (lambda: LinearCamera(camera(), scene(700.0)[1]), "nearest pixel is 700 m away"),
@@ -133,6 +144,11 @@ class TestDepth(BaseTester):
             (lambda: ThinLensCamera().chromatic_defocus(530), "wavelength must be metres between .*530 nm is 530e-9"),
             (lambda: PixelwiseMask(1).dispersion(0.53), "wavelength must be metres between"),
             (lambda: diffraction_cutoff(ThinLensCamera(), 530), "wavelength must be metres between"),
+            (lambda: cauchy_through("", "", ((486, 1.5), (656, 1.4))), "wavelength must be metres between .*got 486"),
+            (lambda: GreyLevels(8, 360), "phase_range must be at most 4 pi radians, got 360: multiply degrees by"),
+            (lambda: GreyLevels(2, response=(0, 0.3, 0.6, 0.9)), "response spans 0.9 rad: multiply waves by 2 pi"),
+            (lambda: PixelCrosstalk(8e-6), "sigma is 8e-06 pixels, as if none: divide metres by the pixel pitch"),
+            (lambda: depth_blur(*scene(1e-3), 1.0, 2.0), "farthest pixel is 0.001 m away, .* kilometres"),
             (lambda: full_well_of(8), "pixel_pitch must be metres between"),
         ],
     )

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import os
 import re
-import warnings
 from collections.abc import Sequence
 
 from kornia_tidy.files import error_prefix, read_text
-from kornia_tidy.modulator.phase_panel import check_response
+from kornia_tidy.modulator.phase_panel import check_response, tell_short_span
 
 LONGEST = 1000  # characters of a line of the header that count
-SHORT = 3.0  # rad; a smaller span is not a whole wave, and in units of pi panels have it
 RADIANS = {"radians": 1.0, "milliradians": 1e-3, "degrees": math.pi / 180, "pi": math.pi, "waves": 2 * math.pi}
 # Words of a header, in lower case.
 _UNITS = {
@@ -79,12 +77,13 @@ def read_response(path: str | os.PathLike[str], bits: int) -> list[float]:
     phases = [RADIANS[unit] * numbers[-1] for _, numbers in rows]
     with error_prefix(f"cannot read {path}"):
         check_response(phases, bits, [line for line, _ in rows])
-    if (span := max(phases) - min(phases)) < SHORT and bits > 1:
-        warnings.warn(
-            f"the response in {path} spans {span:.3g} rad, read as {unit}: if its phases are in another unit, name "
-            f"that in a header, such as 'phase (deg)', 'phase (pi)' or 'phase (waves)'",
-            stacklevel=2,
-        )
+    span = max(phases) - min(phases)
+    tell_short_span(
+        span,
+        bits,
+        f"the response in {path} spans {span:.3g} rad, read as {unit}: if its phases are in another unit, name "
+        f"that in a header, such as 'phase (deg)', 'phase (pi)' or 'phase (waves)'",
+    )
     return phases
 
 
