@@ -190,7 +190,7 @@ def to_tensor(image: NDArray[Any], color: Color = "bgr", light: bool = False) ->
         if not (lowest >= 0 and (highest <= 1 or (light and np.isfinite(highest)))):  # True for NaN
             remedy = ": divide by 255, or give uint8" if 1 < highest <= 255 and lowest >= 0 else ""
             limits = "be finite and not negative" if light else "lie in [0, 1]"
-            raise ValueError(f"a float32 image must {limits}, found {lowest:.6g} to {highest:.6g}{remedy}")
+            raise ValueError(f"a float32 image must {limits}, found {lowest:.9g} to {highest:.9g}{remedy}")
     pixels = image_tensor(image if color == "rgb" else image.reshape(shape)[..., ::-1])
     return pixels if pixels.ndim == 4 else pixels[None]
 

@@ -25,7 +25,9 @@ from kornia_tidy.files import write_bytes
 from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.units import warn_once
 
-UNKNOWN = {np.dtype(np.uint16): 65535, np.dtype(np.float16): 65504}  # largest numbers, which often mark unknown depth
+# Largest numbers of data types, which often mark unknown depth.
+UNKNOWN: dict[Any, float] = {np.dtype(kind): int(np.iinfo(kind).max) for kind in ("u2", "i2", "u4", "i4")}
+UNKNOWN |= {np.dtype(kind): float(np.finfo(kind).max) for kind in ("f2", "f4")}
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 
 
@@ -80,12 +82,12 @@ def read_depth(
         - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
           disparity that is infinite or, with d added, negative.
         - Unknown in a TIFF: pixels with GDAL's missing value, behind a mask, transparent, or left out of the file; see
-          :func:`~kornia_tidy.data.tiff.decode_tiff`. A factor that the file gives for its numbers is not applied. A
-          warning, once per folder, names it if ``scale`` is another.
+          :func:`~kornia_tidy.data.tiff.decode_tiff`. In HDF5: ``_FillValue`` and ``missing_value``. A factor that the
+          file gives for its numbers is not applied. A warning, once per folder, names it if ``scale`` is another.
         - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
           them in ``invalid`` for a data set that means *unknown* by them.
-        - A warning, once per folder, names values that look like *unknown* and are not listed: 65535 far above all
-          other values (65504 in half precision), and in a PFM file infinity below values as large as disparities.
+        - A warning, once per folder, names values that look like *unknown* and are not listed: the largest of the data
+          type, such as 65535, far above all others; in a PFM file infinity below values as large as disparities.
         - Renderers write 1e10 (Blender) or infinity where a ray hits nothing. Both are depths, and to a lens the same.
         - A grey level that a PNG file declares transparent is unknown, as GDAL means it.
         - The orientation of a file is not applied. A warning, once per folder, size and orientation, tells of it.
@@ -159,8 +161,8 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
             warn_once(
                 None,
                 (mark, path.parent),
-                f"{path} holds {mark} where its other values end at {others:g}, and it is taken for a depth: if it "
-                f"means 'unknown', give invalid=[{mark}] (--invalid {mark})",
+                f"{path} holds {mark:.10g} where its other values end at {others:g}, and it is taken for a depth: if it "
+                f"means 'unknown', give invalid=[{mark:.10g}] (--invalid {mark:.10g})",
                 stacklevel=4,
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):

@@ -1,4 +1,4 @@
-"""HDF5 files that hold one map, as Hypersim has them."""
+"""HDF5 files that hold one map, as Hypersim has them, and what their attributes say of its numbers."""
 
 from __future__ import annotations
 
@@ -14,18 +14,31 @@ from kornia_tidy.search_path import import_extra, import_installed
 
 DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"
+_MISSING = ("_FillValue", "missing_value")
+_METRES = {
+    unit: metres
+    for short, long, metres in (("m", "", 1.0), ("cm", "centi", 1e-2), ("mm", "milli", 1e-3), ("km", "kilo", 1e3))
+    for unit in (short, f"{long}meter", f"{long}metre")
+}
 
 
-def decode_hdf5(data: bytes) -> NDArray[Any]:
+def decode_hdf5(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None, float]:
     """Decode the only data set of an HDF5 file. It needs ``pip install 'kornia-tidy[data]'``.
 
     Args:
         data: bytes of the file.
 
+    Returns:
+        values: as they are stored.
+        unknown: True where they are the missing value of the attributes; None if these name none.
+        scale: metres in a unit by the attributes; 1 if they do not say it.
+
     Raises:
         ImportError: if h5py is missing.
         ValueError: if the file is damaged, or holds no data set or several, or a data set in it that does not hold a
-            map of numbers.
+            map of numbers, or whose attributes give an offset for them.
+
+    Source: NetCDF Climate and Forecast Metadata Conventions 1.11, sections 2.5.1, 3.1 and 8.1.
     """
     h5py = import_extra("h5py", "an HDF5 file")  # slow to import
     try:
@@ -35,7 +48,8 @@ def decode_hdf5(data: bytes) -> NDArray[Any]:
             if dataset is None:
                 raise ValueError(f"its HDF5 must hold only one data set, found {', '.join(names)[:80] or 'none'}")
             check_pixels("the map", *_rows_and_columns(dataset.shape))
-            return np.asarray(dataset[()])
+            values = np.asarray(dataset[()])
+            return values, *_meaning(values, dataset.attrs)
     except DAMAGE as error:
         raise ValueError(f"its HDF5 is damaged: {error!s:.200}") from error
 
@@ -63,6 +77,21 @@ def stored_numbers(file: Any, name: str) -> Any:
         raise ValueError(f"the values of {name:.80} in its HDF5 must be numbers, not {dataset.dtype}")
     check_pixels(f"a chunk of {name:.80}", *_rows_and_columns(dataset.chunks or ()))
     return dataset
+
+
+def _meaning(values: NDArray[Any], attributes: Any) -> tuple[NDArray[np.bool_] | None, float]:
+    """Return where values are missing by the attributes, None if these do not say it, and the metres in a unit."""
+    given = {
+        name: np.ravel(attributes[name]) for name in (*_MISSING, "scale_factor", "add_offset") if name in attributes
+    }
+    numbers = {name: value[0] for name, value in given.items() if value.size == 1 and value.dtype.kind in "iuf"}
+    if numbers.get("add_offset", 0):
+        raise ValueError(f"its numbers are to be changed by add_offset {numbers['add_offset']:g}: save the depths")
+    unit = attributes.get("units", "")
+    unit = unit.decode("ascii", "replace") if isinstance(unit, bytes) else str(unit)
+    metres = _METRES.get(unit.strip().lower().removesuffix("s"), 1.0)
+    missing = [values == numbers[name] for name in _MISSING if name in numbers]
+    return np.logical_or.reduce(missing) if missing else None, float(numbers.get("scale_factor", 1)) * metres
 
 
 def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:

@@ -84,7 +84,7 @@ def _scaled(file: Stored, path: str | os.PathLike[str]) -> Tensor:
     elif stored.dtype.kind == "f":
         if not (stored.min() >= 0 and stored.max() <= 1):  # False for NaN too
             raise ValueError(
-                f"cannot read {path}: floats must lie in [0, 1], found {stored.min():.6g} to {stored.max():.6g}"
+                f"cannot read {path}: floats must lie in [0, 1], found {stored.min():.9g} to {stored.max():.9g}"
             )
         values = stored.astype(np.float32)
     else:

@@ -102,7 +102,8 @@ def _decode(data: bytes, depth: bool) -> Stored:
     if data.startswith(NPZ):
         return Stored(decode_npz(data))
     if data.startswith(HDF5):
-        return Stored(decode_hdf5(data))
+        values, unknown, scale = decode_hdf5(data)
+        return Stored(values, unknown=unknown if values.ndim == 2 else None, scale=scale)
     if data.startswith((b"PF", b"Pf")):
         return Stored(decode_pfm(data))
     if data.startswith(EXR):
@@ -140,7 +141,18 @@ def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:
     values = decoded // (255 // white) if bits < 8 else decoded
     clear = next((int.from_bytes(data[b:e], "big") for k, b, e in png_chunks(data) if k == b"tRNS"), None)
     unknown = values == clear if depth and clear is not None else None
+    if depth and (few := next((data[b] for k, b, _ in png_chunks(data) if k == b"sBIT"), bits)) < bits:
+        _check_significant(values, bits, few)
     return Stored(values, white if bits < 8 else None, unknown)
+
+
+def _check_significant(values: NDArray[Any], bits: int, few: int) -> None:
+    """Raise ``ValueError`` if depth was scaled up from fewer bits, which the file tells (PNG, section 11.3.2.7)."""
+    low = values & (2 ** (bits - few) - 1)
+    if values.any() and (not low.any() or (low == values >> few).all()):
+        raise ValueError(
+            f"its numbers of {few} bits were scaled up to {bits} (sBIT): save them as they were, or remove that chunk"
+        )
 
 
 def _decode_with_opencv(data: bytes) -> NDArray[Any]:

@@ -107,6 +107,15 @@ class TestPictureKinds(BaseTester):
         np.testing.assert_array_equal(valid, values[..., 0] > 1)
         assert float(read_image(tmp_path / "a.png").max()) == pytest.approx(values.max() / (2**bits - 1))
 
+    def test_exception_depth_that_was_scaled_up_from_fewer_bits(self, tmp_path):
+        twelve, path = np.arange(500, 500 + ROWS * COLUMNS).reshape(ROWS, COLUMNS, 1), tmp_path / "a.png"
+        for stored in (twelve << 4, twelve << 4 | twelve >> 8):  # with zeros, and as PNG asks for
+            path.write_bytes(png(stored, 16, 0, (b"sBIT", b"\x0c")))
+            with pytest.raises(ValueError, match=r"of 12 bits were scaled up to 16 \(sBIT\)"):
+                read_depth(path, 0.001)
+        path.write_bytes(png(twelve, 16, 0, (b"sBIT", b"\x0c")))
+        np.testing.assert_array_equal(read_depth(path).depth[0], twelve[..., 0])
+
     @pytest.mark.parametrize("bits", [8, 16])
     def test_feature_grey_with_alpha_is_grey(self, bits, tmp_path):
         values = np.random.default_rng(0).integers(1, 2**bits - 1, (ROWS, COLUMNS, 2))

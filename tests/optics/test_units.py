@@ -513,6 +513,13 @@ class TestDepthFiles(BaseTester):
         with pytest.warns(UserWarning, match=r"holds 65535 where its other values end at 4000, .*--invalid 65535"):
             read_depth(tmp_path / "a.png", 0.001)
 
+    @pytest.mark.parametrize("kind", ["i2", "u4", "i4", "f4"])
+    def test_feature_the_largest_number_of_a_type_is_told_as_well(self, kind, tmp_path):
+        most = np.finfo(kind).max if kind == "f4" else np.iinfo(kind).max
+        with pytest.warns(UserWarning, match="where its other values end at 4000, and it is taken for a depth"):
+            read_depth(saved(np.array([[700, most], [900, 4000]], kind), tmp_path), 0.001)
+        assert read_depth(tmp_path / "depth.npy", 0.001, invalid=[float(most)]).valid.sum() == 3
+
     def test_feature_65535_that_is_meant_raises_no_alarm(self, tmp_path):
         path = tmp_path / "a.png"
         cv2.imwrite(str(path), np.array([[700, 65535], [900, 4000]], np.uint16))
