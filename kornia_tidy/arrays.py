@@ -224,7 +224,9 @@ def _planes(array: np.ndarray) -> np.ndarray:
         array = np.moveaxis(array, -1, -3)
     else:
         raise ValueError(f"an array must be (H, W), (H, W, C) or (B, H, W, C), got {array.shape}")
-    return np.array(array, dtype=array.dtype.newbyteorder("="), order="C")  # own memory: torch refuses read-only ones
+    extended = array.dtype.kind == "f" and array.dtype.itemsize > 8  # which torch has no type for
+    dtype = np.dtype(np.float64) if extended else array.dtype.newbyteorder("=")
+    return np.array(array, dtype=dtype, order="C")  # own memory: torch refuses read-only ones
 
 
 def _whole(image: Tensor, dtype: torch.dtype) -> Tensor:

@@ -148,6 +148,10 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     if value.layout != torch.strided or value.is_nested:
         layout = "nested" if value.is_nested else value.layout
         raise TypeError(f"{name} must be a dense tensor, got a {layout} one: convert it, as to_dense() does")
+    if type(value).__name__ == "MaskedTensor":
+        raise TypeError(f"{name} must be a plain tensor, got a MaskedTensor: fill it, such as with {name}.to_tensor(0)")
+    if value.is_floating_point() and value.element_size() < 2:
+        raise TypeError(f"{name} must have 16 bits or more, got {value.dtype}: convert it with {name}.float()")
     if not value.is_floating_point():
         unit = {"depth": " in metres", "image": " with values in [0, 1]"}.get(name.removesuffix("s"), "")
         raise TypeError(f"{name} must be floating point{unit}, got {value.dtype}{_as_float(name, value)}")

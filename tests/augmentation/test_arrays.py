@@ -95,6 +95,7 @@ class TestSimulate(BaseTester):
         assert (first == kornia_tidy.simulate(image, depth, optics=told, seed=0)).all()
         assert (first == second).all()
         assert (first == kornia_tidy.simulate(image, depth, torch.tensor(1.0), seed=np.int64(0))).all()
+        assert (first == kornia_tidy.simulate(image, depth.astype(np.longdouble), seed=0)).all()
         assert (first != other).any()
         assert np.abs(first.astype(int) - other).max() < 0.2 * 65535  # noise of 0.01 in linear light, not other masks
 

@@ -127,6 +127,12 @@ BAD_CALLS: list[tuple[str, tuple[Any, ...], type[Exception], str]] = [
     ("depth of 3 channels", (IMAGE, DEPTH.expand(-1, 3, -1, -1)), ValueError, r"depth must have shape"),
     ("integer image", ((255 * IMAGE).byte(), DEPTH), TypeError, r"image must be floating point .* got torch.uint8"),
     ("sparse image", (IMAGE.to_sparse(), DEPTH), TypeError, "must be a dense tensor, got a torch.sparse_coo one"),
+    (
+        "8-bit floats",
+        (IMAGE.to(torch.float8_e4m3fn), DEPTH),
+        TypeError,
+        "have 16 bits or more, got torch.float8_e4m3fn",
+    ),
     ("integer depth", (IMAGE, DEPTH.long()), TypeError, r"depth must be floating point .* got torch.int64"),
     ("an array", (IMAGE.numpy(), DEPTH), TypeError, r"image must be a torch.Tensor, got ndarray"),
     ("NaN image", (spoilt(IMAGE, torch.nan), DEPTH), ValueError, r"image must be finite, got nan"),
@@ -152,6 +158,11 @@ BAD_CALLS: list[tuple[str, tuple[Any, ...], type[Exception], str]] = [
 
 
 class TestBadInput(BaseTester):
+    @pytest.mark.filterwarnings("ignore:The PyTorch API of MaskedTensors")
+    def test_exception_a_masked_tensor_says_how_to_fill_it(self):
+        with pytest.raises(TypeError, match=r"depth must be a plain tensor, .*depth.to_tensor\(0\)"):
+            camera()(IMAGE, torch.masked.masked_tensor(DEPTH, DEPTH > 0))
+
     @pytest.mark.parametrize(("inputs", "error", "message"), [b[1:] for b in BAD_CALLS], ids=[b[0] for b in BAD_CALLS])
     def test_exception_comes_before_any_work(self, inputs, error, message, monkeypatch):
         optics, before = camera(), torch.get_rng_state()
