@@ -161,8 +161,8 @@ def _tell_of_unknown(path: str | os.PathLike[str], stored: NDArray[Any], kind: s
             warn_once(
                 None,
                 (mark, path.parent),
-                f"{path} holds {mark:.10g} where its other values end at {others:g}, and it is taken for a depth: if it "
-                f"means 'unknown', give invalid=[{mark:.10g}] (--invalid {mark:.10g})",
+                f"{path} holds {mark:.10g} where its other values end at {others:g}, and it is taken for a depth: if "
+                f"it means 'unknown', give invalid=[{mark:.10g}] (--invalid {mark:.10g})",
                 stacklevel=4,
             )
     if path.suffix.lower() == ".pfm" and not any(np.isinf(value) for value in invalid):
