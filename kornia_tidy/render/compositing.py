@@ -7,12 +7,11 @@ Each function makes a layered scene of its arguments (:mod:`kornia_tidy.render.s
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from torch import Tensor
 
 from kornia_tidy.psf.psf_bank import PSFBank
-from kornia_tidy.render.dispatch import render_layers
+from kornia_tidy.render.dispatch import Rendering, render_layers
 
 
 def render(
@@ -59,9 +58,8 @@ def render(
         >>> render(torch.rand(4, 3, 32, 48), torch.zeros(1, 1, 32, 48), bank, border="valid").shape
         torch.Size([4, 3, 28, 44])
     """
-    options: dict[str, Any] = {"compositing": compositing, "layers": layers, "border": border}
-    scene = image, defocus, bank.defocus, bank.psfs, bank.veil
-    return render_layers(*scene, correlate=correlate, method=method, **options)
+    how = Rendering(compositing, border, layers, correlate)
+    return render_layers(image, defocus, bank.defocus, bank.psfs, bank.veil, how, method)
 
 
 def gather(
@@ -109,8 +107,8 @@ def gather(
         >>> (coded[0, 0, 2] * 100).round().int().tolist()
         [0, 0, 25, 75, 0]
     """
-    options: dict[str, Any] = {"compositing": "gather", "layers": layers, "border": border}
-    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    how = Rendering("gather", border, layers, correlate)
+    return render_layers(image, defocus, nodes, psfs, veil, how, method)
 
 
 def scatter(
@@ -149,8 +147,8 @@ def scatter(
 
     Source: Shah et al., TiDy-PSFs, ICCV 2023, caption of the figure of the forward model.
     """
-    options: dict[str, Any] = {"compositing": "scatter", "layers": layers, "border": border}
-    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    how = Rendering("scatter", border, layers, correlate)
+    return render_layers(image, defocus, nodes, psfs, veil, how, method)
 
 
 def occlusion(
@@ -208,8 +206,8 @@ def occlusion(
         >>> (coded[0, 0, 0] * 100).round().int().tolist()
         [0, 33, 67, 100]
     """
-    options: dict[str, Any] = {"compositing": "occlusion", "layers": layers, "border": border}
-    return render_layers(image, defocus, nodes, psfs, veil, correlate=correlate, method=method, **options)
+    how = Rendering("occlusion", border, layers, correlate)
+    return render_layers(image, defocus, nodes, psfs, veil, how, method)
 
 
 COMPOSITING: dict[str, Callable[..., Tensor]] = {"gather": gather, "scatter": scatter, "occlusion": occlusion}

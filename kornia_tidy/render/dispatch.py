@@ -57,11 +57,7 @@ def render_layers(
     nodes: Tensor,
     psfs: Tensor,
     stray_light: Tensor | None,
-    *,
-    compositing: str,
-    layers: str,
-    border: str,
-    correlate: bool,
+    rendering: Rendering,
     method: str = "auto",
     field: Field | None = None,
 ) -> Tensor:
@@ -69,15 +65,11 @@ def render_layers(
 
     Args:
         image: (B, C, H, W) linear light.
-        defocus: as the other tensors and ``layers`` to ``correlate`` in
-            :func:`kornia_tidy.render.scene.layered_scene`.
+        defocus: as the other tensors in :func:`kornia_tidy.render.scene.layered_scene`.
         nodes: as there.
         psfs: as there.
         stray_light: as there.
-        compositing: ``"gather"``, ``"scatter"`` or ``"occlusion"``.
-        layers: as there.
-        border: as there.
-        correlate: as there.
+        rendering: how.
         method: ``"auto"`` or the name of a backend, see :func:`choose`.
         field: where over the picture PSFs (F, D, C, P, P) are known; default: they are the same everywhere.
 
@@ -89,16 +81,17 @@ def render_layers(
         TypeError: if a tensor is not floating point.
         ValueError: if shapes do not fit or a choice is not known, and as :func:`choose`.
     """
-    if compositing not in COMPOSITINGS:
-        check_choice("compositing", compositing, COMPOSITINGS)
+    if rendering.compositing not in COMPOSITINGS:
+        check_choice("compositing", rendering.compositing, COMPOSITINGS)
     mode = torch_mode()
     if nodes.device.type != "cpu" and Mode.UNREAD not in mode:
         check_nodes(nodes)
-    if layers == "nearest" or len(nodes) == 1:  # nothing depends smoothly on defocus
+    if rendering.layers == "nearest" or len(nodes) == 1:  # nothing depends smoothly on defocus
         defocus, nodes = defocus.detach(), nodes.detach()
     render = _rendered if Mode.TRANSFORM in mode else torch.ops.kornia_tidy.render_layers
+    how = rendering.compositing, rendering.layers, rendering.border, rendering.correlate
     over = [] if field is None else [*field.size, *field.nodes, *field.origin, field.cell, field.still]
-    return render(image, defocus, nodes, psfs, stray_light, compositing, layers, border, correlate, over, method)
+    return render(image, defocus, nodes, psfs, stray_light, *how, over, method)
 
 
 def choose(scene: LayeredScene, method: str = "auto") -> Backend:
@@ -116,7 +109,10 @@ def choose(scene: LayeredScene, method: str = "auto") -> Backend:
         ValueError: if the method is not known, or does not support the scene.
     """
     if method != "auto":
-        return _named(scene, method)
+        check_choice("method", method, ("auto", *BACKENDS))
+        if (why := refusal(BACKENDS[method], scene)) is not None:
+            raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
+        return BACKENDS[method]
     if Mode.TRANSFORM in torch_mode():
         return BACKENDS["dense"]
     if scene.image.device.type != "cpu":
@@ -135,13 +131,6 @@ def _keeps_little(scene: LayeredScene) -> bool:
     inputs = scene.image, scene.layer_weight, scene.psfs, scene.stray_light
     recorded = torch.is_grad_enabled() and any(wants_gradient(x) for x in inputs)
     return not recorded and 8 * scene.image.numel() <= LARGEST_PLANE
-
-
-def _named(scene: LayeredScene, method: str) -> Backend:
-    check_choice("method", method, ("auto", *BACKENDS))
-    if (why := refusal(BACKENDS[method], scene)) is not None:
-        raise ValueError(f"method {method!r} does not support this scene: {why}; method='auto' takes one that does")
-    return BACKENDS[method]
 
 
 def refusal(backend: Backend, scene: LayeredScene) -> str | None:

@@ -75,7 +75,7 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
         given = light, defocus, bank.defocus, psfs[0] if alike else psfs, None
         whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus))))
         with torch.set_grad_enabled(whole and torch.is_grad_enabled()):
-            tiled = render_layers(*given, **vars(rendering), field=None if alike else field)
+            tiled = render_layers(*given, rendering, field=None if alike else field)
         if whole:
             return tiled if bank.veil is None else tiled + _veil(light, defocus, bank, field, rendering)
     plane, deep, inside, around = light, defocus, None, field
@@ -219,8 +219,7 @@ class _Cells:
         return lay_over(near_to_far()).to(window.dtype)
 
     def _rendered(self, light: Tensor, depths: Tensor, own: slice, psfs: Tensor, border: str) -> Tensor:
-        given = vars(replace(self.rendering, border=border))
-        return render_layers(light, depths, self.bank.defocus[own], psfs, None, **given)
+        return render_layers(light, depths, self.bank.defocus[own], psfs, None, replace(self.rendering, border=border))
 
     def _lines(self, deep: Tensor, margin: int) -> Iterator[tuple[_Steps, tuple[int, Tensor]]]:
         """Yield rows of cells with their PSFs at the nodes along the rows, values and slopes, (D, 2 nx, C P P)."""

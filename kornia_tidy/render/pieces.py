@@ -183,7 +183,7 @@ def render_piece(light: Tensor, defocus: Tensor, piece: Piece, rendering: Render
     if piece.field is not None and isinstance(bank, FieldBank):
         seen = render_over_field(light, defocus, bank, piece.field, rendering)
     else:
-        seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, **vars(rendering))
+        seen = render_layers(light, defocus, bank.defocus, bank.psfs, bank.veil, rendering)
     if inside is not None and gathers:
         seen = torch.where(cropped(inside, margin), seen, 0)
     if isinstance(piece.share, Tensor) and piece.share.ndim:

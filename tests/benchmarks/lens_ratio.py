@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import torch
 
@@ -62,7 +62,7 @@ def ratios(size: tuple[int, int], window: int, compositing: str, rounds: int) ->
     rendering = Rendering(compositing, "reflect")
 
     def of_axis(psfs: torch.Tensor) -> torch.Tensor:
-        return render_layers(image, psi, bank.defocus, psfs[0], None, **asdict(rendering))
+        return render_layers(image, psi, bank.defocus, psfs[0], None, rendering)
 
     def of_field(bank: FieldBank) -> torch.Tensor:
         return render_over_field(image, psi, bank, field, rendering)

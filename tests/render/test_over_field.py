@@ -50,8 +50,8 @@ class TestRenderOverField(BaseTester):
         field = Field(SIZE, nodes, cell=20, still=10 if border == "valid" else 0)
         (light, defocus), bank = scene_of(), bright(bank_over(field))
         given = light, defocus, bank.defocus, bank.psfs, None
-        options = {"compositing": compositing, "border": border, "layers": "linear", "correlate": border == "zero"}
-        tiles, whole = (render_layers(*given, method=name, field=field, **options) for name in ("compiled", "dense"))
+        how = Rendering(compositing, border, correlate=border == "zero")
+        tiles, whole = (render_layers(*given, how, name, field) for name in ("compiled", "dense"))
         self.assert_close(tiles, whole, rtol=0, atol=1e-13)
 
     @pytest.mark.parametrize("layers", ["linear", "nearest"])
@@ -64,8 +64,7 @@ class TestRenderOverField(BaseTester):
         found = []
         for method in ("compiled", "dense"):
             given = *leaves[:2], bank.defocus, leaves[2], None
-            options = {"compositing": compositing, "border": "reflect", "layers": layers, "correlate": False}
-            seen = render_layers(*given, method=method, field=field, **options)
+            seen = render_layers(*given, Rendering(compositing, "reflect", layers), method, field)
             found.append(torch.autograd.grad(seen, wanted, gradient))
         for own, expected in zip(*found, strict=True):
             self.assert_close(own, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
@@ -77,8 +76,8 @@ class TestRenderOverField(BaseTester):
         bank, gradient = bright(bank_over(field)), torch.randn(2, 2, *SIZE, dtype=torch.float64)
         psfs, found = bank.psfs.requires_grad_(), []
         for method in ("compiled", "dense"):
-            options = {"compositing": "occlusion", "border": border, "layers": layers, "correlate": False}
-            seen = render_layers(*scene_of(), bank.defocus, psfs, None, method=method, field=field, **options)
+            how = Rendering("occlusion", border, layers)
+            seen = render_layers(*scene_of(), bank.defocus, psfs, None, how, method, field)
             found.append(torch.autograd.grad(seen, psfs, gradient)[0])
         self.assert_close(*found, rtol=0, atol=1e-12 * float(found[1].abs().max()))
 
@@ -89,9 +88,8 @@ class TestRenderOverField(BaseTester):
         bank = bright(bank_over(field))
         leaves, rendering = [x.requires_grad_() for x in scene_of()], Rendering("occlusion", border)
         seen = render_over_field(*leaves, bank, field, rendering)
-        options = {"method": "compiled", "field": field, "layers": "linear", "correlate": False}
         given = *leaves, bank.defocus, bank.with_all_light().psfs, None
-        expected = render_layers(*given, compositing="occlusion", border=border, **options)
+        expected = render_layers(*given, rendering, "compiled", field)
         self.assert_close(seen, expected, rtol=0, atol=1e-6)  # the divisors have another EPSILON
         for one, other in zip(*(torch.autograd.grad(x.square().sum(), leaves) for x in (seen, expected)), strict=True):
             self.assert_close(one, other, rtol=0, atol=1e-4 * float(other.abs().max()))
@@ -140,10 +138,10 @@ class TestRenderOverField(BaseTester):
         light = torch.rand(1, 2, 6, 7, dtype=torch.float64, requires_grad=True)
         psfs = bank.psfs[..., 3:6, 3:6].clone().requires_grad_()
         defocus = torch.linspace(-3.5, 4.5, 42, dtype=torch.float64).view(1, 1, 6, 7)
-        options = {"compositing": compositing, "border": "reflect", "layers": "linear", "correlate": False}
+        how = Rendering(compositing, "reflect")
 
         def render(light: torch.Tensor, psfs: torch.Tensor) -> torch.Tensor:
-            return render_layers(light, defocus, bank.defocus, psfs, None, method="auto", field=field, **options)
+            return render_layers(light, defocus, bank.defocus, psfs, None, how, field=field)
 
         assert torch.autograd.gradcheck(render, (light, psfs), fast_mode=True)
         assert torch.autograd.gradgradcheck(render, (light, psfs), fast_mode=True)
@@ -175,11 +173,10 @@ class TestRenderOverField(BaseTester):
     def test_exception_backends_of_one_psf(self):
         field = Field(SIZE, (2, 2))
         (light, defocus), bank = scene_of(), bank_over(field)
-        options = {"border": "reflect", "layers": "linear", "correlate": False, "field": field}
         given = light, defocus, bank.defocus, bank.psfs, None
         for compositing in ("gather", "occlusion"):
             with pytest.raises(ValueError, match=r"method 'batched' does not .* vary over the picture .*cell by cell"):
-                render_layers(*given, compositing=compositing, method="batched", **options)
+                render_layers(*given, Rendering(compositing, "reflect"), "batched", field)
 
 
 def bright(bank: FieldBank) -> FieldBank:
