@@ -18,7 +18,7 @@ from kornia_tidy.augmentation.depth_augmentation import (
 )
 from kornia_tidy.augmentation.pipeline_transform import PipelineTransform, draws_at
 from kornia_tidy.augmentation.scene_geometry import SceneGeometry, warped_entries
-from kornia_tidy.camera.holes import DEPTH_KEYS, both_valid, fills_holes
+from kornia_tidy.camera.holes import both_valid, fills_holes, names_in, with_parts
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_choice
 from kornia_tidy.optics.holes import HOLES, fill_holes
@@ -106,12 +106,7 @@ class OpticsPipeline(nn.Module):
                 raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
             given = image[0], image[1], getattr(image, "valid", None), {}, params
             coded, warped, _, valid, _ = self._scene(*given, getattr(image, "field_center", None))
-            parts, make = [coded, warped, *image[2:]], cast("Any", type(image))
-            if not hasattr(image, "_fields"):
-                return make(parts)
-            if "valid" in image._fields:
-                parts[image._fields.index("valid")] = valid
-            return make(*parts)
+            return with_parts(image, coded, warped, valid)
         if depth is None:
             raise ValueError(
                 "depth is missing: call pipeline(image, depth), pipeline((image, depth)) or pipeline(mapping)"
@@ -123,27 +118,23 @@ class OpticsPipeline(nn.Module):
         return PipelineTransform(self, seed, key)
 
     def _mapping(self, sample: Mapping[str, Any], params: Mapping[str, Any] | None) -> dict[str, Any]:
-        keys = [key for key in DEPTH_KEYS if key in sample]
-        if "image" not in sample or len(keys) != 1:
-            raise KeyError(
-                f"a mapping sample needs an 'image', and its depth under 'depth' or 'mask_depth', "
-                f"got the keys {list(sample)}"
-            )
+        names = names_in(sample)
         mask = sample.get("mask")
-        given = {} if mask is None or str(mask.dtype) != "torch.bool" else {"mask": mask}
-        given |= {"valid": sample["valid"]} if isinstance(sample.get("valid"), Tensor) else {}
-        taken = ("image", keys[0], *given)
+        shown = {} if mask is None or str(mask.dtype) != "torch.bool" else {"mask": mask}
+        shown |= {"valid": sample["valid"]} if isinstance(sample.get("valid"), Tensor) else {}
+        taken = (*names, *shown)
         others = {} if self.geometry is None else warped_entries(sample, taken)
-        known = reduce(both_valid, given.values()) if given else None
+        known = reduce(both_valid, shown.values()) if shown else None
         place = sample.get("field_center")
-        coded, depth, clean, valid, warped = self._scene(sample["image"], sample[keys[0]], known, others, params, place)
-        out = {**sample, **warped, "image": coded, "all_in_focus": clean, keys[0]: depth}
+        image, depth = (sample[name] for name in names)
+        coded, depth, clean, valid, warped = self._scene(image, depth, known, others, params, place)
+        out = {**sample, **warped, "image": coded, "all_in_focus": clean, names[1]: depth}
         if "field_center" in self.params:
             out["field_center"] = self.params["field_center"]
-        names = [*given, *(["valid"] if fills_holes(self.optics, self.holes) else [])]
-        if valid is not None and not names and not bool(valid.all()):
-            names = ["mask" if mask is None else "mask_of_valid_depth"]
-        return out if valid is None else {**out, **dict.fromkeys(names, valid)}
+        masks = [*shown, *(["valid"] if fills_holes(self.optics, self.holes) else [])]
+        if valid is not None and not masks and not bool(valid.all()):
+            masks = ["mask" if mask is None else "mask_of_valid_depth"]
+        return out if valid is None else {**out, **dict.fromkeys(masks, valid)}
 
     def _scene(
         self,

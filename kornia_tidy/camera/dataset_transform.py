@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy.arrays import cropped_image, depth_tensor, image_tensor, like_image
-from kornia_tidy.camera.holes import DEPTH_KEYS, filled_depth, fills_holes, with_filled
+from kornia_tidy.camera.holes import DEPTH_KEYS, filled_depth, fills_holes, names_in, with_filled
 from kornia_tidy.camera.samples import with_capture
 from kornia_tidy.checks import check_choice, check_positive
 from kornia_tidy.optics.holes import HOLES
@@ -96,7 +96,8 @@ class DatasetTransform:
         options: dict[str, Any] = {} if generator is None else {"generator": generator}
         if isinstance(sample, Mapping):
             options |= {"field_center": sample["field_center"]} if "field_center" in sample else {}
-            names = self._names(sample)
+            depths = DEPTH_KEYS if self.depth_key is None else (self.depth_key,)
+            names = names_in(sample, self.image_key, depths, ": give image_key= and depth_key=")
             image, depth = (sample[name] for name in names)
             plain = names[0] == "image" and names[1] in DEPTH_KEYS
         elif isinstance(sample, (tuple, list)) and len(sample) > 1:
@@ -120,17 +121,6 @@ class DatasetTransform:
     def _capture(self, image: Tensor, depth: Tensor, **options: Any) -> Tensor:
         """Return the capture of an image in the image's rank."""
         return self.optics(image, depth, **options)
-
-    def _names(self, sample: Mapping[str, Any]) -> tuple[str, str]:
-        """Return the names of image and depth in a mapping."""
-        depths = DEPTH_KEYS if self.depth_key is None else (self.depth_key,)
-        found = [name for name in depths if name in sample]
-        if self.image_key not in sample or len(found) != 1:
-            raise KeyError(
-                f"a mapping sample needs an {self.image_key!r}, and its depth under {' or '.join(map(repr, depths))}, "
-                f"got the keys {list(sample)}: give image_key= and depth_key="
-            )
-        return self.image_key, found[0]
 
     def _item(self, sample: Any) -> int:
         if not isinstance(self.key, str):

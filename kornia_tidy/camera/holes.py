@@ -1,4 +1,4 @@
-"""Holes of the depth that a camera or an adapter takes: who fills them, and how the mask of known pixels comes back."""
+"""Forms of samples and holes of their depth: who fills them, and how the mask of known pixels comes back."""
 
 from __future__ import annotations
 
@@ -14,6 +14,54 @@ from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.thin_lens import DefocusRange
 
 DEPTH_KEYS = ("depth", "mask_depth")  # the second is how kornia's containers know a map that must be warped
+
+
+def names_in(
+    sample: Mapping[str, Any], image: str = "image", depths: Sequence[str] = DEPTH_KEYS, remedy: str = ""
+) -> tuple[str, str]:
+    """Return the names of image and depth in a mapping.
+
+    Args:
+        sample: the mapping.
+        image: name of the image.
+        depths: possible names of the depth.
+        remedy: to be put behind the message.
+
+    Raises:
+        KeyError: if there is no image, or not one depth.
+
+    Example:
+        >>> names_in({"mask_depth": None, "image": None})
+        ('image', 'mask_depth')
+    """
+    found = [name for name in depths if name in sample]
+    if image not in sample or len(found) != 1:
+        raise KeyError(
+            f"a mapping sample needs an {image!r}, and its depth under {' or '.join(map(repr, depths))}"
+            f"{', in one place only' if len(found) > 1 else ''}, got the keys {list(sample)}{remedy}"
+        )
+    return image, found[0]
+
+
+def with_parts(sample: Any, image: Any, depth: Any, valid: Any) -> Any:
+    """Return a tuple or list ``(image, depth, ...)`` with other parts, a named one with its field ``valid`` too.
+
+    Args:
+        sample: the tuple or list.
+        image: in the place of its image.
+        depth: in the place of its depth.
+        valid: in the place of its mask of valid pixels; None leaves that.
+
+    Example:
+        >>> with_parts(["image", "depth", 3], "coded", "depth", None)
+        ['coded', 'depth', 3]
+    """
+    parts, make = [image, depth, *sample[2:]], cast("Any", type(sample))
+    if not hasattr(sample, "_fields"):
+        return make(parts)
+    if valid is not None and "valid" in sample._fields:
+        parts[sample._fields.index("valid")] = valid
+    return make(*parts)
 
 
 def fills_holes(optics: Any, holes: str = "error") -> bool:
@@ -77,12 +125,8 @@ def with_filled(sample: Any, depth: Any, valid: Any, names: Sequence[str] = DEPT
     if isinstance(sample, Mapping):
         name = next(name for name in names if name in sample)
         return {**sample, name: depth, "valid": known_in(sample, valid)}
-    parts, make = [sample[0], depth, *sample[2:]], cast("Any", type(sample))
-    if not hasattr(sample, "_fields"):
-        return make(parts)
-    if "valid" in sample._fields:
-        parts[sample._fields.index("valid")] = valid if sample.valid is None else both_valid(valid, sample.valid)
-    return make(*parts)
+    earlier = getattr(sample, "valid", None)
+    return with_parts(sample, sample[0], depth, valid if earlier is None else both_valid(valid, earlier))
 
 
 def both_valid(valid: Any, earlier: Any) -> Any:

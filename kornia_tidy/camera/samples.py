@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import get_worker_info
 
-from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, with_filled
+from kornia_tidy.camera.holes import DEPTH_KEYS, fills_holes, names_in, with_filled, with_parts
 from kornia_tidy.checks import check_finite, check_float_tensor, check_generator
 from kornia_tidy.fidelity import Fidelity
 from kornia_tidy.kernels.precision import widest
@@ -127,12 +127,7 @@ def with_capture(
         maps |= {} if valid is None else {"valid": valid}
         smaller = {name: crop(value, margin) for name, value in maps.items()} if margin else {}
         return {**sample, names[0]: coded, "all_in_focus": crop(sample[names[0]], margin), **smaller}
-    parts, make = [coded, crop(sample[1], margin), *sample[2:]], cast("Any", type(sample))
-    if not hasattr(sample, "_fields"):
-        return make(parts)
-    if valid is not None:
-        parts[sample._fields.index("valid")] = crop(valid, margin)
-    return make(*parts)
+    return with_parts(sample, coded, crop(sample[1], margin), None if valid is None else crop(valid, margin))
 
 
 def read_sample(
@@ -160,16 +155,15 @@ def read_sample(
             filled consists of holes.
         KeyError: if a mapping has no image or no depth.
     """
-    form = None
-    if isinstance(image, Mapping):
-        form = image
+    form: Any = image if isinstance(image, (Mapping, tuple, list)) else None
+    if form is not None and depth is not None:
+        raise ValueError("a mapping or a tuple holds its depth: call optics(sample) without another depth")
+    if isinstance(form, Mapping):
         field_center = form.get("field_center") if field_center is None else field_center
-        image, depth = _image_and_depth(image, depth)
-    elif isinstance(image, (tuple, list)):
-        if len(image) < 2 or depth is not None:
-            raise ValueError(f"a tuple sample must be (image, depth, ...), got {len(image)} entries")
-        form = image
-        image, depth = image[:2]
+        image, depth = (form[name] for name in names_in(form))
+    elif form is not None:
+        missing: list[Any] = [None, None]
+        image, depth = [*form, *missing][:2]
     if torch.jit.is_tracing():
         refuse_torchscript()
     if generator is not None:
@@ -236,19 +230,6 @@ def check_light(image: Tensor, camera: CheckedCamera) -> None:
         said = check_image(image, encoded=camera.color_space != "linear")
         if said is not None:
             warn_once(camera.notes.told, "image", said, stacklevel=7)
-
-
-def _image_and_depth(sample: Mapping[str, Any], depth: Any) -> tuple[Any, Any]:
-    """Return the image and the depth of a mapping."""
-    keys = [key for key in DEPTH_KEYS if key in sample]
-    if "image" not in sample:
-        raise KeyError(f"a mapping sample needs an 'image', got the keys {list(sample)}")
-    if depth is not None or len(keys) != 1:
-        raise KeyError(
-            f"a mapping sample needs its depth under 'depth' or 'mask_depth', and in one place only, got the keys "
-            f"{list(sample)}"
-        )
-    return sample["image"], sample[keys[0]]
 
 
 def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera, depth: Tensor) -> Tensor:
