@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, PixelwiseMask, TiDyOptics
-from kornia_tidy.accuracy import psf_samples
-from kornia_tidy.accuracy.candidates import REFERENCE
+from kornia_tidy.accuracy.planning import planner
+from kornia_tidy.accuracy.planning.planner import REFERENCE
 from kornia_tidy.masks import CubicMask
 from tests.accuracy.planning_rig import MASKS, Rig, smooth
 
@@ -113,7 +113,7 @@ def _rig(compositing: str, border: str, mask: str) -> Rig:
 
 def judge(case: Case) -> Outcome:
     """Plan a case's scene and capture it both ways."""
-    with warnings.catch_warnings(), patch.object(psf_samples, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
+    with warnings.catch_warnings(), patch.object(planner, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
         warnings.simplefilter("ignore")  # that windows this narrow do not hold the light they should
         rig, (light, defocus) = _rig(case.compositing, case.border, case.mask), case.scene()
         plan = rig.planner.scene(defocus, light).plan(case.tolerance)

@@ -26,9 +26,10 @@ import torch
 from torch import Tensor, nn
 
 from kornia_tidy import DefocusRange, FresnelLens, NoMask, PixelwiseMask, Spectrum, ThinLensCamera, TiDyOptics
-from kornia_tidy.accuracy import RenderPlan, psf_samples
-from kornia_tidy.accuracy.candidates import REFERENCE
+from kornia_tidy.accuracy import RenderPlan
+from kornia_tidy.accuracy.planning import planner
 from kornia_tidy.accuracy.planning.plan import LEAST_TOLERANCE, plan_scene
+from kornia_tidy.accuracy.planning.planner import REFERENCE
 from kornia_tidy.masks import CubicMask, FourierMask, PhaseMasks, RadialMask, SpiralMask, ZernikeMask
 from kornia_tidy.modulator import DiffractionEfficiency, DwellTimes, GreyLevels, SpatialLightModulator
 from kornia_tidy.optics import REFERENCE_WAVELENGTH, Lens, annular_aperture, camera_spectrum, circular_aperture
@@ -122,7 +123,7 @@ def trial(seed: int, real: bool = False) -> Trial:
     light, defocus, kind = _scene(optics, lenses, g)
     drawn |= {"scene": kind, "size": list(light.shape[-2:])}
     tolerance = _one(TOLERANCES[: 4 if real else 5], g)  # places of a field keep to no less
-    with warnings.catch_warnings(), patch.object(psf_samples, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
+    with warnings.catch_warnings(), patch.object(planner, "REFERENCE", REFERENCE.replace(max_window=NARROW)):
         warnings.simplefilter("ignore")  # that windows this narrow do not hold the light they should
         plan = plan_scene(optics, defocus, light, light.shape[:2], tolerance)
         measured = (_ray_error if plan.fidelity.window is None else _error)(optics, light, defocus, plan)

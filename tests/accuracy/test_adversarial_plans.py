@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import DefocusRange, Fidelity, FresnelLens, TiDyOptics
-from kornia_tidy.accuracy import psf_samples
-from kornia_tidy.accuracy.candidates import REFERENCE
+from kornia_tidy.accuracy.planning import planner
+from kornia_tidy.accuracy.planning.planner import REFERENCE
 from tests.accuracy.adversarial_scenes import COMPOSITINGS, MASK_KINDS, SCENES, TOLERANCES, Case, judge, report
 from tests.accuracy.planning_rig import Rig
 from tests.base import BaseTester
@@ -70,7 +70,7 @@ class TestAdversarialScenes(BaseTester):
     @pytest.mark.parametrize("border", ["reflect", "zero"])
     def test_feature_light_through_a_gap_has_the_blur_of_the_gap(self, monkeypatch, border, background, own):
         """Points of light behind a background half way between layers: off 2.2 times the tolerance before."""
-        monkeypatch.setattr(psf_samples, "REFERENCE", REFERENCE.replace(max_window=33))
+        monkeypatch.setattr(planner, "REFERENCE", REFERENCE.replace(max_window=33))
         lens = FresnelLens(10.0), DefocusRange(-40, 40)
         rig = Rig(TiDyOptics(*lens, sensor=None, compositing="occlusion", border=border, fidelity=Fidelity(window=3)))
         light, defocus = torch.zeros(1, 3, 40, 40), torch.full((1, 1, 40, 40), background)

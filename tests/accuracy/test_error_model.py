@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kornia_tidy import Fidelity, PixelwiseMask, TiDyOptics
+from kornia_tidy.accuracy import Planner
 from kornia_tidy.accuracy.depth_energy import Depths, octave_filters
 from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
-from kornia_tidy.accuracy.psf_samples import PSFSamples
 from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, natural_power, power_spectrum
 from kornia_tidy.render import render
 from tests.base import BaseTester
@@ -97,7 +97,7 @@ class TestLayers(BaseTester):
         """Against the capture of a point, which is the layered PSF of the camera."""
         fidelity = Fidelity(window=15, layers=layers, layer_spacing=1.0, stray_light="discard", double=True)
         optics = TiDyOptics(PixelwiseMask(1), sensor=None, fidelity=fidelity, color_space="linear", border="zero")
-        samples, psi = PSFSamples(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
+        samples, psi = Planner(optics, 3), torch.tensor([-7.3], dtype=torch.float64)
         weights, at = layer_coefficients(psi, optics.defocus_nodes, layers, samples.band)
         point = torch.zeros(1, 3, 15, 15, dtype=torch.float64)
         point[..., 7, 7] = 1
@@ -111,9 +111,9 @@ class TestLayers(BaseTester):
     def test_feature_large_psfs_are_made_for_a_depth_at_a_time(self, monkeypatch):
         """And not remembered; they are the same."""
         optics, depths = TiDyOptics(PixelwiseMask(1), sensor=None), (-7.3, 0.2, 11.0)
-        at_once = PSFSamples(optics, 3).layered("cubic", 1.0, depths, 15)
-        monkeypatch.setattr("kornia_tidy.accuracy.psf_samples._LARGEST_REMEMBERED", 13)
-        self.assert_close(PSFSamples(optics, 3).layered("cubic", 1.0, depths, 15), at_once, rtol=0, atol=1e-12)
+        at_once = Planner(optics, 3).layered("cubic", 1.0, depths, 15)
+        monkeypatch.setattr("kornia_tidy.accuracy.planning.planner._LARGEST_REMEMBERED", 13)
+        self.assert_close(Planner(optics, 3).layered("cubic", 1.0, depths, 15), at_once, rtol=0, atol=1e-12)
 
     def test_feature_a_pixel_of_a_very_wide_range_takes_the_layers_around_it(self):
         """The weights of all its fine layers would be some gigabytes."""

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from kornia_tidy import DefocusRange, DwellTimes, Fidelity, PixelwiseMask, PSFBank, Spectrum, TiDyOptics
-from kornia_tidy.accuracy.candidates import LAYER_SPACINGS, REFERENCE
-from kornia_tidy.accuracy.planning.planner import PlannedScene, Planner
+from kornia_tidy.accuracy.planning.planner import LAYER_SPACINGS, REFERENCE, PlannedScene, Planner
 from kornia_tidy.fidelity import LAYERS
 from kornia_tidy.optics import camera_spectrum
 from kornia_tidy.render import render
@@ -103,7 +102,7 @@ class TestTolerance(BaseTester):
     def narrow(self, monkeypatch):
         """A reference of 65 pixels at most: a tenth of the time, and all that is predicted is there."""
         monkeypatch.setattr(
-            "kornia_tidy.accuracy.psf_samples.REFERENCE", REFERENCE.replace(name="reference", max_window=65)
+            "kornia_tidy.accuracy.planning.planner.REFERENCE", REFERENCE.replace(name="reference", max_window=65)
         )
 
     @pytest.mark.takes_seconds

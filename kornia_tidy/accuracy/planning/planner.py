@@ -20,10 +20,12 @@ its window, and the darkening of pixels that are reached by a small part of a PS
 
 from __future__ import annotations
 
+import warnings
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, wraps
 from itertools import product
 from typing import Any
 
@@ -31,23 +33,36 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from kornia_tidy.accuracy.candidates import PIXEL_TOLERANCES, REFERENCE, WINDOW_STRAY_LIGHT, layer_kinds, window_steps
 from kornia_tidy.accuracy.costs import bank_work, rendering_work, window_side
 from kornia_tidy.accuracy.depth_energy import Depths
 from kornia_tidy.accuracy.error_model import change_error, layer_coefficients
 from kornia_tidy.accuracy.planning.render_plan import RenderPlan
-from kornia_tidy.accuracy.psf_samples import PSFSamples, remembered
 from kornia_tidy.accuracy.scene_light import CONTRAST, SceneLight, interpolation, spectrum_size
 from kornia_tidy.checks import check_positive
 from kornia_tidy.fidelity import Fidelity
-from kornia_tidy.psf.defocus_interpolation import TAPS, fine_nodes
+from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
+from kornia_tidy.psf.defocus_interpolation import TAPS, defocus_band, fine_nodes
 from kornia_tidy.psf.field import Field
+from kornia_tidy.psf.lens_limits import check_defocus_range
 from kornia_tidy.psf.psf_cache import nodes_around
+from kornia_tidy.psf.psf_model import PSFModel
+from kornia_tidy.psf.psf_window import FittedWindow
+from kornia_tidy.psf.spectral_binning import bin_spectrum
 from kornia_tidy.render.backend import Work
 from kornia_tidy.render.backends.dense_occlusion import EPSILON
-from kornia_tidy.render.borders import cropped
+from kornia_tidy.render.borders import check_border, cropped, largest_window
 from kornia_tidy.render.stray_light import share_in_frame, share_within
 
+REFERENCE = Fidelity.preset("reference")
+LAYER_SPACINGS = {
+    "nearest": (8.0, 4.0, 2.0, 1.0),
+    "linear": (8.0, 4.0, 2.0, 1.0, 0.5, 0.25),
+    "cubic": (2.0, 1.0),
+    "bandlimited": (2.0, 1.0),
+}
+PIXEL_TOLERANCES = (1e-1, 2e-2, 1e-3, 1e-6)
+WINDOW_STRAY_LIGHT = ("veil", "renormalize")  # the better one depends on window and image
+RATIO = 1.2  # between successive candidates of the window and of the number of wavelengths
 SAFETY = 1.4  # factor for layers and wavelengths; measured errors are up to 1.3 times the formula
 WINDOW_SAFETY = 1.7  # factor for windows; measured up to 1.5, as tails are sampled at a few depths only
 FLOAT32_ERROR = 4e-7  # root mean square, relative to the light; measured with mutual intensity up to 3.3e-7
@@ -60,9 +75,25 @@ _OUTLINE = 1.0  # rad between neighbouring pixels; larger steps are outlines of 
 _ENOUGH = 0.05  # of the tolerance: with errors below it, more wavelengths bring nothing
 _DEPTHS = 16  # of the scene at which PSFs are compared
 _WINDOW = 65  # px, to compare all but windows: a fifth of the light lies outside, but a few per cent of its square
+_TOLERANCE = 0.3  # pixel tolerance of the samples: some per cent suffice for differences of PSFs
+_LARGEST_REMEMBERED = 129  # px; layers of all kinds take hundreds of PSFs, and share many
+_WAVELENGTHS = 7  # at most, in the samples: PSFs then have errors of half a per cent
 
 
-class Planner(PSFSamples):
+def remembered(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method whose results its object keeps, by its arguments, in a dictionary ``_known``."""
+
+    @wraps(method)
+    def recalled(self: Any, *given: Any) -> Any:
+        key = (method, *given)
+        if key not in self._known:
+            self._known[key] = method(self, *given)
+        return self._known[key]
+
+    return recalled
+
+
+class Planner:
     """Planner of scenes for one camera; PSF samples of the masks are computed once and shared by all scenes.
 
     The samples belong to the masks at the time of construction. ``optics.plan`` plans one scene for one tolerance.
@@ -79,6 +110,22 @@ class Planner(PSFSamples):
         [True, True]
     """
 
+    def __init__(self, optics: Any, channels: int) -> None:
+        self.model: PSFModel = optics.psf_model
+        own = self.model.spectrum
+        self.spectrum = own if channels == len(own.weights) else Spectrum.monochrome()
+        states = len(self.model.state_weights(torch.float32))
+        # For occlusion each state is rendered separately, see Fidelity.occlusion_states.
+        self.captures = states if optics.compositing == "occlusion" else 1
+        self.together = states // self.captures
+        self.band = defocus_band(self.model.pupil.max_rho2, min(own.wavelengths), REFERENCE_WAVELENGTH)
+        self.border: str = optics.border
+        self.compositing: str = optics.compositing
+        self.channels, self.planes = channels, len(self.spectrum.plane_weights)
+        self.wide_blur = self.model.wide_blur if optics.compositing == "gather" else None
+        self.fewest = len(self.spectrum.basis or (1,))
+        self._known: dict[Any, Any] = {}
+
     def scene(self, defocus: Tensor, light: Tensor | None = None) -> PlannedScene:
         """Return a scene to ask for errors and plans.
 
@@ -87,6 +134,84 @@ class Planner(PSFSamples):
             light: (B, C, H, W) linear light. Default: a typical photograph.
         """
         return PlannedScene(self, defocus, light)
+
+    def spectrum_of(self, count: int | None) -> Spectrum:
+        """Return the spectrum, binned to a number of wavelengths unless that is None."""
+        return self.spectrum if count is None else bin_spectrum(self.spectrum, count)
+
+    @remembered
+    def nodes(self, layers: str, spacing: float) -> tuple[float, ...]:
+        """Return the defocus of layers of a kind and spacing."""
+        return self.model.with_fidelity(replace(REFERENCE, layers=layers, layer_spacing=spacing)).defocus_nodes
+
+    def reference(self, height: int, width: int) -> Fidelity:
+        """Return the reference for images of this size, its window fixed: that of wide blur, where it is."""
+        if self.wide_blur is not None:
+            return replace(REFERENCE, window=self.wide_blur.window)
+        limit = min(REFERENCE.max_window, largest_window(self.border, height, width))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the widest allowed window misses the encircled energy
+            window = self.model.with_fidelity(REFERENCE.replace(max_window=limit)).window
+        return replace(REFERENCE, window=min(window, limit))  # a wide defocus disc takes more than the border allows
+
+    def allows(self, reference: Fidelity, height: int, width: int) -> bool:
+        """Return whether a reference keeps to the limits of the lens and of the border."""
+        try:
+            check_defocus_range(self.model.camera.defocus_range, self.model.pixel_step, reference, reference.window)
+            check_border(self.border, height, width, window_side(reference))
+        except ValueError:
+            return False
+        return True
+
+    @torch.no_grad()
+    def psfs(
+        self,
+        nodes: Sequence[float],
+        window: int,
+        tolerance: float = _TOLERANCE,
+        wavelengths: int | None = _WAVELENGTHS,
+        dtype: torch.dtype = torch.float64,
+    ) -> Tensor:
+        """Return exact PSFs at ascending defocus, (D, C, P, P)."""
+        most = None if wavelengths is None else max(self.fewest, wavelengths)
+        model = self._model(window, tolerance, most).without_memory()
+        return model.psf_bank(self.channels, dtype, tuple(nodes)).psfs.cpu()
+
+    @torch.no_grad()
+    def layered(self, layers: str, spacing: float, depths: Sequence[float], window: int) -> Tensor:
+        """Return the PSFs that layers of a kind and spacing give to pixels at some depths, (D, C, P, P)."""
+        if window > _LARGEST_REMEMBERED and len(depths) > 1:  # a depth of band-limited layers takes a dozen of them
+            return torch.cat([self.layered(layers, spacing, [psi], window) for psi in depths])
+        psi = torch.tensor(depths, dtype=torch.float64)
+        weights, at = layer_coefficients(psi, self.nodes(layers, spacing), layers, self.band)
+        used = (weights != 0).any(0)
+        nodes = tuple(psi for psi, needed in zip(at, used.tolist(), strict=True) if needed)
+        psfs = self._sampling(window).psf_bank(self.channels, torch.float64, nodes).psfs.cpu()
+        return (weights[:, used] @ psfs.flatten(1)).unflatten(1, psfs.shape[1:])
+
+    @remembered
+    def _sampling(self, window: int) -> PSFModel:
+        """Return the model of the compared PSFs; a copy has its own memory."""
+        model = self._model(window, _TOLERANCE, max(self.fewest, _WAVELENGTHS))
+        return model.without_memory() if window > _LARGEST_REMEMBERED else copy(model)
+
+    @torch.no_grad()
+    def binned(self, count: int | None, depths: Sequence[float], window: int) -> Tensor:
+        """Return PSFs with binned wavelengths, of each channel and basis reflectance, (D, C, B, P, P)."""
+        spectrum = self.spectrum_of(count)
+        planes = torch.zeros((), dtype=torch.float64)
+        for wavelength, shares in zip(spectrum.wavelengths, zip(*spectrum.plane_weights, strict=True), strict=True):
+            one = self._model(window, 1e-3, None, spectrum=Spectrum.monochrome(wavelength))
+            psfs = one.without_memory().psf_bank(1, torch.float64, depths).psfs.cpu()
+            planes = planes + psfs * torch.tensor(shares, dtype=torch.float64)[:, None, None]
+        return planes.unflatten(1, (self.channels, -1))
+
+    def _model(self, window: int, tolerance: float, wavelengths: int | None, **parts: Any) -> PSFModel:
+        """Return the model with PSFs in a window, before anything is done about stray light."""
+        points = {"pixel_tolerance": tolerance, "wavelengths": wavelengths}
+        fidelity = REFERENCE.replace(window=window, stray_light="discard", **points)
+        # Nobody asks how much of the light it holds.
+        return self.model.replace(fidelity=fidelity, **parts).with_window(FittedWindow(window, (0.0, 1.0)))
 
 
 class PlannedScene:
@@ -164,7 +289,9 @@ class PlannedScene:
     def _within(self, tolerance: float) -> Iterator[Fidelity]:
         """Yield the narrowest window within a tolerance for each combination of the other settings."""
         windows, counts = window_steps(self._full), tuple(self._wavelength_counts(tolerance))
-        for layers, points, count in product(layer_kinds(), PIXEL_TOLERANCES, counts):
+        kinds = [(kind, spacing) for kind, spacings in LAYER_SPACINGS.items() for spacing in spacings]
+        for (kind, spacing), points, count in product(kinds, PIXEL_TOLERANCES, counts):
+            layers = replace(REFERENCE, layers=kind, layer_spacing=spacing)
             full = replace(layers, window=windows[-1], double=False, pixel_tolerance=points, wavelengths=count)
             if self.error(full) > tolerance:
                 continue
@@ -175,7 +302,10 @@ class PlannedScene:
 
     def _wavelength_counts(self, tolerance: float) -> Iterator[int | None]:
         """Yield candidate numbers of wavelengths, up to the first with an error small against the tolerance."""
-        for count in self.planner.wavelength_counts():
+        planner, spectrum = self.planner, self.planner.spectrum
+        # One wavelength per channel is a separate model, not a sample of a broader spectrum.
+        single = all(sum(weight > 0 for weight in row) == 1 for row in spectrum.weights)
+        for count in () if single else wavelength_steps(planner.fewest, len(spectrum.wavelengths)):
             error = SAFETY * self._wavelength_error(count)
             if error <= tolerance:
                 yield count
@@ -198,7 +328,7 @@ class PlannedScene:
             memory_bytes=max(round(held * bank.memory), rendering.memory),
             layers=layers,
             window=window_side(fidelity),
-            wavelengths=(len(planner.spectrum_of(fidelity).wavelengths), len(planner.spectrum.wavelengths)),
+            wavelengths=(len(planner.spectrum_of(fidelity.wavelengths).wavelengths), len(planner.spectrum.wavelengths)),
             states=planner.captures,
         )
 
@@ -364,7 +494,7 @@ class PlannedScene:
         planner, (computed, _) = self.planner, self._layers(fidelity.layers, fidelity.layer_spacing)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
         rendering = self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
-        spectrum = planner.spectrum_of(fidelity)
+        spectrum = planner.spectrum_of(fidelity.wavelengths)
         return bank_work(planner.model, spectrum, planner.together, fidelity, computed), rendering
 
     @remembered
@@ -374,3 +504,29 @@ class PlannedScene:
         planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
         how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
         return rendering_work(*given, **how, field=field)
+
+
+def window_steps(largest: int) -> tuple[int, ...]:
+    """Return the candidate window sides, ascending, each about a fifth narrower than the next.
+
+    Example:
+        >>> window_steps(41)
+        (3, 5, 7, 9, 11, 13, 15, 17, 21, 25, 29, 35, 41)
+    """
+    windows = [largest]
+    while windows[0] > 3:
+        windows.insert(0, min(windows[0] - 2, 2 * int(windows[0] / RATIO / 2) + 1))
+    return tuple(windows)
+
+
+def wavelength_steps(fewest: int, all_of_them: int) -> tuple[int, ...]:
+    """Return the candidate numbers of wavelengths, ascending, below the number of the spectrum.
+
+    Example:
+        >>> wavelength_steps(1, 31)
+        (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25)
+    """
+    counts = [all_of_them]
+    while counts[0] > fewest:
+        counts.insert(0, max(fewest, min(counts[0] - 1, int(counts[0] / RATIO))))
+    return tuple(counts[:-1])

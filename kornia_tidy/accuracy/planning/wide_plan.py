@@ -46,7 +46,7 @@ def plan_rays(optics: Any, blur: WideBlur, scene: PlannedScene, defocus: Tensor,
     images = scene.images, planner.channels
     grids = [(defocus[..., :: group.grid, :: group.grid], group.window, own) for group, own in held]
     works = [rendering_work(at, *images, own, window, border="replicate") for at, window, own in grids]
-    spectrum = planner.spectrum_of(fidelity)
+    spectrum = planner.spectrum_of(fidelity.wavelengths)
     works.append(bank_work(model, spectrum, 1, fidelity.replace(window=blur.window), len(exact)))
     return RenderPlan(
         fidelity=fidelity,
