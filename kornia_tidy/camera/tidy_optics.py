@@ -76,7 +76,7 @@ def _part(name: str, meaning: str, *, settable: bool = False) -> Any:
     """Return a property that is the PSF model's; to set it puts another model in the place of the present one."""
 
     def swap(self: Any, value: Any) -> None:
-        self._swap(**{name: value})
+        self.psf_model = self.psf_model.replace(**{name: value})
 
     return property(lambda self: getattr(self.psf_model, name), swap if settable else None, doc=meaning)
 
@@ -284,7 +284,7 @@ class TiDyOptics(nn.Module):
         if name not in _SUBMODULES:
             super().__setattr__(name, value)
             return
-        self._swap(**{name: value})
+        self.psf_model = self.psf_model.replace(**{name: value})
         self._take(name)
 
     def _take(self, name: str) -> None:
@@ -294,9 +294,6 @@ class TiDyOptics(nn.Module):
             super().__setattr__(name, part)
         else:
             self._modules.pop(name, None)  # an aperture that is not learnt is the PSF model's alone
-
-    def _swap(self, **parts: Any) -> None:
-        self.psf_model = self.psf_model.replace(**parts)
 
     def __prepare_scriptable__(self) -> NoReturn:
         """Refuse ``torch.jit.script`` of this camera and of modules that contain it."""

@@ -514,10 +514,8 @@ class PSFModel:
         tolerance = self.fidelity.pixel_tolerance if tolerance is None else tolerance
         step = self.pixel_step * grid
         light = states, weights, pupil, spectrum, dispersion, nodes
-        plain = (
-            self.aperture is not None and self._amplitude is not None
-        ) or each_state  # compiled as plain operations
-        if torch_mode() == Mode.GRAPH and not (plain or isinstance(step, Tensor)):
+        shaped = self.aperture is not None and self._amplitude is not None
+        if torch_mode() == Mode.GRAPH and not (shaped or each_state or isinstance(step, Tensor)):
             return operator_psf_bank(*light, step, window, tolerance, shift)
         return exact_psf_bank(*light, step, window, tolerance, shift, each_state, self._remembers)
 

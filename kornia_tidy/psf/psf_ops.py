@@ -90,14 +90,10 @@ def _psfs(*arguments: Any) -> Tensor:
         return MEMORY.recall(values_of("operator", *shown, *parts), tuple(nodes), make)[0].clone()
 
 
-def _shape(*arguments: Any) -> tuple[int, ...]:
+def _psfs_fake(*arguments: Any) -> Tensor:
     waves, rows, basis, nodes, window = arguments[6], arguments[7], arguments[8], arguments[-4], arguments[-2]
     planes = len(rows) // len(waves) * (len(basis) // len(waves) if basis else 1)
-    return len(nodes), planes, window, window
-
-
-def _psfs_fake(*arguments: Any) -> Tensor:
-    return arguments[0].new_empty(_shape(*arguments))
+    return arguments[0].new_empty(len(nodes), planes, window, window)
 
 
 define_recomputed(

@@ -228,13 +228,12 @@ def runs_of(present: list[bool], most: int) -> list[tuple[int, int]]:
 
 
 def _most_layers(
-    model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, compositing: str, budget: int, points: int = 1
+    model: PSFModel, channels: int, dtype: torch.dtype, reach: Tensor, compositing: str, budget: int, points: int
 ) -> tuple[int | None, bool]:
     """Return the most layers of a piece, None where all fit at once, and whether PSFs are remembered."""
     whole, fidelity = (None, True), model.fidelity
-    if torch_mode() or not reach.numel() or model.measured is not None:
-        return whole
-    if fidelity.layers not in ("nearest", "linear") or (layers := len(nodes_around(model.defocus_nodes, reach))) < 3:
+    layers = len(nodes_around(model.defocus_nodes, reach))
+    if not reach.numel() or fidelity.layers not in ("nearest", "linear") or layers < 3:
         return whole
     psfs, work = layer_bytes(model, channels, dtype)
     psfs = psfs if points == 1 else psfs * points * _FIELD_COPIES // _COPIES

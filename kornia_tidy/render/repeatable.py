@@ -18,10 +18,8 @@ def repeatable() -> Generator[None]:
         1
     """
     threads = torch.get_num_threads()
-    if threads != 1:
-        torch.set_num_threads(1)
+    torch.set_num_threads(1)
     try:
         yield
     finally:
-        if threads != 1:
-            torch.set_num_threads(threads)
+        torch.set_num_threads(threads)
