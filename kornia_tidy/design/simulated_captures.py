@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from statistics import fmean
 
 import torch
 from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
@@ -54,20 +55,20 @@ def candidate_optics(task: DesignTask, candidate: Candidate, fidelity: Fidelity 
         fidelity,
         color_space="linear",
         lens=task.real_lens(candidate.f_number, candidate.focus),
-        field_center=task.places()[1] if task.lens else (0.0, 0.0),  # outside of half the field
     )
 
 
-def _bank_of(optics: TiDyOptics, defocus: list[float] | None = None) -> PSFBank:
-    """Return the PSFs of a camera at the middle of its pictures."""
+def _banks(task: DesignTask, optics: TiDyOptics, defocus: list[float] | None = None) -> list[PSFBank]:
+    """Return the PSFs of a camera at each of the task's places, of an ideal lens once."""
     if optics.lens is None:
-        return optics.psf_bank(defocus=defocus)
-    return optics.psf_bank(defocus=defocus, field=[optics.field_center]).at(0)
+        return [optics.psf_bank(defocus=defocus)]
+    field = optics.psf_bank(defocus=defocus, field=task.places())
+    return [field.at(index) for index in range(len(field.psfs))]
 
 
 @torch.no_grad()
 def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Scene], seed: int = 0) -> Iterable[Scores]:
-    """Yield the scores of a candidate on each scene.
+    """Yield the scores of a candidate on each scene, behind a real lens the mean over the task's places.
 
     Args:
         task: the task with the weight of depth: parts without a weight are not scored.
@@ -81,23 +82,26 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
     """
     optics = candidate_optics(task, candidate)
     noise = task.noise(candidate.f_number)
-    bank = _bank_of(optics)
-    lo, hi = optics.camera.defocus_range
-    depths = _bank_of(optics, torch.linspace(lo, hi, DEPTHS).tolist()) if task.depth_weight > 0 else bank
+    banks = _banks(task, optics)
+    cameras = [optics] if optics.lens is None else [optics.with_bank(bank) for bank in banks]
+    nodes = torch.linspace(*optics.camera.defocus_range, DEPTHS).tolist()
+    banks_by_depth = _banks(task, optics, nodes) if task.depth_weight > 0 else banks
 
-    @lru_cache(maxsize=1)
-    def forms(size: tuple[int, int]) -> tuple[WienerFilter | None, DepthLikelihood | None, list[WienerFilter]]:
+    @lru_cache(maxsize=len(banks))
+    def forms(
+        place: int, size: tuple[int, int]
+    ) -> tuple[WienerFilter | None, DepthLikelihood | None, list[WienerFilter]]:
+        bank, depths = banks[place], banks_by_depth[place]
         wiener = WienerFilter(bank, noise, task.statistics, size) if task.depth_weight < 1 else None
         likelihood = DepthLikelihood(depths, noise, task.statistics, size) if task.depth_weight > 0 else None
         by_depth = depth_filters(depths, noise, task.statistics, size) if wiener and likelihood else []
         return wiener, likelihood, by_depth
 
-    for number, scene in enumerate(scenes):
-        wiener, likelihood, by_depth = forms((scene.image.shape[-2], scene.image.shape[-1]))
+    def scores_at(place: int, scene: Scene, generator: torch.Generator) -> Scores:
+        wiener, likelihood, by_depth = forms(place, (scene.image.shape[-2], scene.image.shape[-1]))
         depth = scene.depth.clamp(*task.depth_range)
-        generator = torch.Generator().manual_seed(keyed_seed(seed, "noise", number))
         light = rgb_to_linear_rgb(scene.image.expand(3, -1, -1))[None]
-        capture = optics(light, depth[None], generator=generator)
+        capture = cameras[place](light, depth[None], generator=generator)
         scores: Scores = {}
         probabilities = {} if likelihood is None else likelihood(capture)
         if wiener is not None:
@@ -108,7 +112,15 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
         if probabilities:
             truth, valid = _normalised_inverse(depth[0], task.depth_range), scene.valid[0]
             scores["depth"] = {name: _decibels(mean_depth(p) - truth, valid) for name, p in probabilities.items()}
-        yield scores
+        return scores
+
+    for number, scene in enumerate(scenes):
+        generator = torch.Generator().manual_seed(keyed_seed(seed, "noise", number))
+        found = [scores_at(place, scene, generator) for place in range(len(banks))]
+        yield {
+            part: {name: fmean(at_place[part][name] for at_place in found) for name in settings}
+            for part, settings in found[0].items()
+        }
 
 
 def leaf_scenes(count: int, size: int, depth_range: tuple[float, float], seed: int = 0) -> list[Scene]:

@@ -11,62 +11,81 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from kornia_tidy import Fidelity, FresnelLens, NoMask, SensorNoise, TiDyOptics
 from kornia_tidy.data import photographic_leaves
+from kornia_tidy.design.design_task import DesignTask, mask_of
 from kornia_tidy.masks import CubicMask, PhaseMasks, PixelwiseMask, SpiralMask, initial_heights
-from kornia_tidy.optics import Lens, ThinLensCamera
+from kornia_tidy.masks.base import mask_axes
+from kornia_tidy.optics import ThinLensCamera
 from kornia_tidy.reconstruction.camera_system import any_camera_system
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light
 from kornia_tidy.reconstruction.metrics import psnr
 from kornia_tidy.reconstruction.pretrained import load_pretrained
 from kornia_tidy.reconstruction.tasks import metres
+from kornia_tidy.reconstruction.trained import load_camera
 from tests.benchmarks.any_camera.scores import ELECTRONS, READ_ELECTRONS
 from tests.benchmarks.results.scenes import real_scenes
 
 PICTURE, PITCH = (1110, 1282), 8e-6
 WINDOW = 65  # px of the PSFs
-DEFOCUS = 20.0  # rad, the most on either side of focus
+DEPTHS = (0.2975, math.inf)  # m: 20 rad on either side of focus at f/17.6
 MARGIN = 16  # px at the edges that are not scored
 NOISES = (1.0, 3.0, 10.0)  # times the sensor's, that closed forms may be told
 ELEMENTS = ("chang2019", "sitzmann2018")  # published systems that are single elements
 CASES = (
-    "edof-5", "edof-designed", "spiral", "focal sweep", "cubic", "fresnel", "none", "none f/11", "none f/25", *ELEMENTS
+    "edof-5", "edof-5 f/25", "edof-designed", "spiral", "focal sweep", "smooth sweep", "smooth sweep f/25", "cubic",
+    "fresnel", "none", "none f/25", "none f/48", *ELEMENTS
 )  # fmt: skip
 
 
 def camera_of(name: str) -> TiDyOptics:
-    """Return a camera at the axis: a published one, or the single element with masks at f/17.6 or without at another.
+    """Return a camera at the axis: published, saved, or the single element with masks, by "NAME f/NUMBER" (f/17.6).
 
-    Masks are learnt, drawn by a seed, lenses of several powers, a cubic or a diffractive lens.
+    Masks are learnt, drawn by a seed, lenses of several powers, a cubic or a diffractive lens. A shipped system has its
+    own f-number, if none is named, and focus; a smooth sweep focuses on all depths in turn.
     """
     fidelity = Fidelity(window=WINDOW, stray_light="veil")
     if name in ELEMENTS:
         return TiDyOptics.from_preset(name, lens="own", fidelity=fidelity, sensor=None, compositing="gather")
+    if Path(name).is_file():
+        saved = load_camera(name)
+        assert saved is not None
+        return TiDyOptics(saved.masks, saved.camera, saved.modulator, None, fidelity, lens=saved.lens)
     random = torch.Generator().manual_seed(3)
     kind, _, number = name.partition(" f/")
+    f_number, focus = float(number or 17.6), 0.595
+    if kind.startswith("edof"):
+        own = load_pretrained(kind).optics
+        assert isinstance(own.camera, ThinLensCamera)
+        f_number, focus = float(number or own.camera.f_number), float(own.camera.focus_distance)
+    task = DesignTask(lens="single-50mm", depth_range=DEPTHS, pixel_pitch=PITCH)
+    given = f_number, DEPTHS[0] / focus  # inverse depth as a fraction of the range
+    camera, lens = task.camera(*given), task.real_lens(*given)
     masks: PhaseMasks
     if kind.startswith("edof"):
-        masks = load_pretrained(kind).optics.masks
+        masks = own.masks
     elif kind == "focal sweep":
         masks = PixelwiseMask(initial=initial_heights(kind, random)[:5])
     else:
         masks = {
+            "smooth sweep": lambda: _smooth_sweep(*camera.defocus_range),
             "spiral": lambda: SpiralMask(3, 46, generator=random),
             "cubic": lambda: CubicMask(20.0, 46),
             "fresnel": FresnelLens,
             "none": lambda: NoMask(23),
         }[kind]()
-    lens = Lens.named("single-50mm", float(number or 17.6), 0.595)
-    whole = lens.camera(PITCH)
-    per_dioptre = math.pi * (whole.aperture_diameter / 2) ** 2 / 530e-9
-    nearest, farthest = (1 / whole.focus_distance + sign * DEFOCUS / per_dioptre for sign in (1, -1))
-    camera = lens.camera(PITCH, (1 / nearest, 1 / max(farthest, 1e-9)))
     return TiDyOptics(masks, camera, None, None, fidelity, lens=lens)
+
+
+def _smooth_sweep(lo: float, hi: float) -> PixelwiseMask:
+    y, x = mask_axes(92)
+    return mask_of(-torch.linspace(lo, hi, 32)[:, None, None] * (x.square() + y.square()).float())
 
 
 def scenes(side: int, count: int) -> list[tuple[str, Tensor, Tensor]]:
@@ -152,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--side", type=int, default=192, help="of the scenes in pixels (192)")
     parser.add_argument("--scenes", type=int, default=8, help="(8)")
     parser.add_argument("--head", choices=CLOSED_FORMS, default="wiener-bilateral", help="(wiener-bilateral)")
-    parser.add_argument("--cameras", nargs="+", choices=CASES, default=CASES, help="(all)")
+    parser.add_argument("--cameras", nargs="+", default=CASES, help=f"or files of saved ones ({', '.join(CASES)})")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
     print("| camera | electrons | centre | corner, field | axis | corner, best noise |\n|---|---|---|---|---|---|")
