@@ -97,9 +97,10 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
         by_depth = depth_filters(depths, noise, task.statistics, size) if wiener and likelihood else []
         return wiener, likelihood, by_depth
 
-    def scores_at(place: int, scene: Scene, generator: torch.Generator) -> Scores:
+    def scores_at(place: int, scene: Scene, number: int) -> Scores:
         wiener, likelihood, by_depth = forms(place, (scene.image.shape[-2], scene.image.shape[-1]))
         depth = scene.depth.clamp(*task.depth_range)
+        generator = torch.Generator().manual_seed(keyed_seed(seed, "noise", number))
         light = rgb_to_linear_rgb(scene.image.expand(3, -1, -1))[None]
         capture = cameras[place](light, depth[None], generator=generator)
         scores: Scores = {}
@@ -115,8 +116,7 @@ def score_candidate(task: DesignTask, candidate: Candidate, scenes: Sequence[Sce
         return scores
 
     for number, scene in enumerate(scenes):
-        generator = torch.Generator().manual_seed(keyed_seed(seed, "noise", number))
-        found = [scores_at(place, scene, generator) for place in range(len(banks))]
+        found = [scores_at(place, scene, number) for place in range(len(banks))]
         yield {
             part: {name: fmean(at_place[part][name] for at_place in found) for name in settings}
             for part, settings in found[0].items()

@@ -89,6 +89,20 @@ class TestRealLens(BaseTester):
         [scores] = score_candidate(task, found, leaf_scenes(1, 140, task.depth_range))
         assert {"image", "depth"} == set(scores)
 
+    def test_feature_captures_are_scored_at_places_over_the_field(self, monkeypatch):
+        """One place alone misleads: without masks the outer one is 3 dB below the inner one."""
+        task = DesignTask(lens="single-50mm", depth_range=(0.5, 0.7))
+        flat, scenes = flat_candidate(task, 14.0, 0.2), leaf_scenes(1, 140, task.depth_range)
+        [over_field] = score_candidate(task, flat, scenes)
+        each = []
+        for place in task.places():
+            monkeypatch.setattr(DesignTask, "places", lambda self, own=place: (own,))
+            each += [one["image"] for one in score_candidate(task, flat, scenes)]
+        best = [max(one.values()) for one in each]
+        assert best[0] > best[2] + 1
+        for name, score in over_field["image"].items():
+            assert score == pytest.approx(sum(one[name] for one in each) / 3, abs=0.01)
+
     def test_exception(self):
         with pytest.raises(ValueError, match="lens must be one of"):
             DesignTask(lens="sonnar")
