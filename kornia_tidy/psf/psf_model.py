@@ -802,15 +802,10 @@ class PSFModel:
         if self.aperture is None or (amplitude := self._amplitude) is None:
             return pupil
         shown = self.state if self.moment is None else self.moment
-        if self.lens is None:
-            pupil = pupil.with_amplitude(amplitude)
-            return pupil if shown is None else pupil.of_masks(slice(shown, shown + 1))
-        if amplitude.ndim == 2:
-            return pupil.cut_by_a_lens(amplitude)
         times = self.timeline(torch.promote_types(self.masks.phase.dtype, torch.float32)).durations
-        if shown is not None:
+        if shown is not None and amplitude.ndim == 3:
             amplitude, times = amplitude[shown : shown + 1], torch.ones_like(times[:1])
-        return pupil.cut_by_a_lens(amplitude, times)
+        return pupil.with_amplitude(amplitude, times, cut=self.lens is not None)
 
     @property
     def _amplitude(self) -> Tensor | None:

@@ -63,32 +63,21 @@ class Pupil:
         """Share of the light in the field of the cells: 1, and less where cells at a hard edge hold its mean only."""
         return min(1.0, float(self.amplitude.double().square().sum()) * self.cell_pitch**2 / self.light)
 
-    def with_amplitude(self, amplitude: Tensor) -> Pupil:
-        """Return this pupil with amplitudes, learnt or one for each mask, of one light each; its open part stays.
-
-        Args:
-            amplitude: (n, n), or (K, n, n) for K masks.
-        """
-        pupil = copy.copy(self)
-        light = amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
-        shared = amplitude.detach().double().square()
-        transmission = (shared if shared.ndim == 2 else shared.mean(0)).cpu()
-        vars(pupil).update(amplitude=amplitude / light.sqrt(), transmission=transmission, light=1.0)
-        return pupil
-
-    def cut_by_a_lens(self, amplitude: Tensor, shares: Tensor | None = None) -> Pupil:
-        """Return this pupil with amplitudes that are not scaled to one light: a lens's stop cuts them too.
+    def with_amplitude(self, amplitude: Tensor, shares: Tensor, *, cut: bool) -> Pupil:
+        """Return this pupil with amplitudes, learnt or one for each mask; its open part stays.
 
         Args:
             amplitude: (n, n), or (K, n, n) for K masks.
             shares: fraction of the exposure of each mask, (K,), to average the light of several amplitudes.
+            cut: whether a lens's stop cuts them too. Otherwise each is scaled to let a light of one through.
         """
-        pupil = copy.copy(self)
-        transmission = amplitude.double().square()
-        if shares is not None:
-            transmission = torch.tensordot(shares.to(transmission), transmission, 1)
-        light = float(transmission.detach().sum()) * self.cell_pitch**2
-        vars(pupil).update(amplitude=amplitude, transmission=transmission.cpu(), light=light)
+        pupil, passed = copy.copy(self), amplitude.double().square()
+        if passed.ndim == 3:
+            passed = torch.tensordot(shares.to(passed), passed, 1)
+        light = amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
+        total = float(passed.detach().sum()) * self.cell_pitch**2 if cut else 1.0
+        scaled = amplitude if cut else amplitude / light.sqrt()
+        vars(pupil).update(amplitude=scaled, transmission=passed.cpu(), light=total)
         return pupil
 
     def of_masks(self, masks: slice) -> Pupil:
