@@ -63,8 +63,6 @@ class AugmentationTransform(DatasetTransform):
         torch.uint8
     """
 
-    takes_samples = False
-
     def _capture(self, image: Tensor, depth: Tensor, **options: Any) -> Tensor:
         generator, field_center = options.get("generator"), options.get("field_center")
         with torch.random.fork_rng(enabled=generator is not None):

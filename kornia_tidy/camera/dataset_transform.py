@@ -58,9 +58,6 @@ class DatasetTransform:
         True
     """
 
-    takes_samples = True
-    """Whether the camera takes tuples and mappings itself."""
-
     def __init__(
         self,
         optics: nn.Module,
@@ -92,26 +89,21 @@ class DatasetTransform:
                 return self._coded(sample, generator)
 
     def _coded(self, sample: Any, generator: torch.Generator | None = None) -> Any:
-        """Return the sample with its image coded; arrays and PIL images are converted to tensors and back."""
+        """Return the sample with its image coded; what is no float tensor is converted to one and back."""
         options: dict[str, Any] = {} if generator is None else {"generator": generator}
         if isinstance(sample, Mapping):
             options |= {"field_center": sample["field_center"]} if "field_center" in sample else {}
             depths = DEPTH_KEYS if self.depth_key is None else (self.depth_key,)
             names = names_in(sample, self.image_key, depths, ": give image_key= and depth_key=")
             image, depth = (sample[name] for name in names)
-            plain = names[0] == "image" and names[1] in DEPTH_KEYS
         elif isinstance(sample, (tuple, list)) and len(sample) > 1:
-            names, (image, depth), plain = DEPTH_KEYS, sample[:2], True
+            names, (image, depth) = DEPTH_KEYS, sample[:2]
         else:
             return self.optics(sample, **options)  # raises
         if fills_holes(self.optics, self.holes):
             depth, valid = filled_depth(depth)
             sample = with_filled(sample, depth, valid, names[1:])
-        metres = self.depth_scale in (None, 1) and isinstance(depth, Tensor) and depth.is_floating_point()
         device = next(chain(self.optics.parameters(), self.optics.buffers()), torch.empty(0)).device
-        ready = self.takes_samples and plain and metres and isinstance(image, Tensor) and image.is_floating_point()
-        if ready and image.device == depth.device == device:
-            return self.optics(sample, **options)
         whole = image_tensor(image)
         coded = self._capture(whole.to(device), depth_tensor(depth, self.depth_scale).to(device), **options)
         coded = coded.to(whole.device)

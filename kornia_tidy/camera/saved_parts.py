@@ -67,8 +67,8 @@ def modulator_of_state(state: Mapping[str, Tensor]) -> nn.Module | None:
     return cast("nn.Module", part_of("modulator", settings, state)) if known else None
 
 
-def check_parts(state: Mapping[str, Tensor], here: Mapping[str, Any]) -> None:
-    """Raise an error where a part of a saved camera differs from the present one, and cannot be made with its settings.
+def checked_settings(state: Mapping[str, Tensor], here: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a saved camera, to be taken over by the present one: their parts can be made.
 
     Of masks only the limits are checked, since a state may lack their weights; of classes that this package does not
     offer, nothing.
@@ -78,7 +78,7 @@ def check_parts(state: Mapping[str, Tensor], here: Mapping[str, Any]) -> None:
         here: settings of the present camera.
 
     Raises:
-        ValueError: if a part cannot be made.
+        ValueError: if there are no settings, or a part that differs cannot be made.
     """
     settings = settings_in(state)
     if "masks" in settings and settings["masks"] != here["masks"]:
@@ -86,6 +86,7 @@ def check_parts(state: Mapping[str, Tensor], here: Mapping[str, Any]) -> None:
     for name in ("camera", "modulator", "sensor", "spectrum", "fidelity"):
         if name in settings and settings[name] != here[name] and _classes(settings[name]) <= {*KINDS, "Sequential"}:
             part_of(name, settings, state)
+    return settings
 
 
 def settings_in(state: Mapping[str, Tensor]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from kornia_tidy.camera.samples import (
     defocus_extremes_in_one_read,
     read_sample,
 )
-from kornia_tidy.camera.saved_parts import check_parts
+from kornia_tidy.camera.saved_parts import checked_settings
 from kornia_tidy.camera.strips import Strip, placed, rows_at_once, strips_of
 from kornia_tidy.checks import check_choice, check_finite, check_positive
 from kornia_tidy.fidelity import PRESETS, Fidelity
@@ -763,13 +763,7 @@ class TiDyOptics(nn.Module):
             (<All keys matched successfully>, 9e-06)
         """
         if take_over:
-            if EXTRA_STATE not in state_dict:
-                raise ValueError(
-                    f"there are no settings to take over: the state has no entry {EXTRA_STATE!r}, only "
-                    f"{', '.join(state_dict) or 'nothing'}"
-                )
-            check_parts(state_dict, self.settings())
-            saved, rehearsal = read_settings(state_dict[EXTRA_STATE]), copy.deepcopy(self)
+            saved, rehearsal = checked_settings(state_dict, self.settings()), copy.deepcopy(self)
             for camera in (rehearsal, self):  # so that an error changes nothing
                 camera._take_over(saved)
                 keys = nn.Module.load_state_dict(camera, state_dict, strict, assign)
