@@ -1,6 +1,6 @@
 """Restoration at the corner of a single element beside its centre, by the PSFs of the place and by those of the axis.
 
-``python -m tests.benchmarks.restored_corner``; half an hour. The same scenes in both places: the middles of real ones
+``python -m tests.benchmarks.restored_corner``; three minutes. The same scenes in both places: the middles of real ones
 where they are on the machine, and painted ones. Decibels below the centre: the corner by the PSFs over the field and by
 those of the axis; and by the PSFs of the place where each place is told the noise, of three, that restores it best: a
 closed form that loses much more than this was told the wrong noise.
