@@ -133,6 +133,13 @@ class TestTheSameCamera(BaseTester):
         two.load_state_dict(stored(one.state_dict(), "torch"))
         assert torch.equal(capture(camera(two)), capture(camera(one)))
 
+    def test_feature_an_aperture_is_in_it_while_it_is_learnt(self):
+        optics, aperture = small(), circular_aperture(23, 0.1)
+        for given in (nn.Parameter(aperture), None, nn.Parameter(aperture), aperture):
+            optics.aperture = given
+            learnt = isinstance(given, nn.Parameter)
+            assert ("aperture.amplitude" in optics.state_dict()) == learnt == ("aperture" in optics._modules)
+
     def test_feature_one_state_of_it(self):
         one, two = (TiDyOptics(PixelwiseMask(2), fidelity="draft") for _ in range(2))
         trained(one)

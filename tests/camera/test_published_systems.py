@@ -130,8 +130,8 @@ class TestFromPreset(BaseTester):
             preset("tidy-1", mask=None)
 
     def test_feature_overrides_replace_parts_and_nothing_else(self):
-        optics = preset("ikoma2021", masks=PixelwiseMask(2, 30), sensor=None)
-        assert optics.pupil.amplitude.shape == (30, 30)  # the iris follows the mask's pixels
+        optics = preset("ikoma2021", masks=PixelwiseMask(2, (30, 40)), sensor=None)
+        assert optics.pupil.amplitude.shape == (30, 30)  # the iris follows the pixels of the mask's shorter side
         assert optics.sensor is None
         assert (optics.compositing, optics.camera.focus_distance) == ("occlusion", 1.7)
         assert preset("tidy-1", masks=None).masks.phase.shape == (1, 23, 23)

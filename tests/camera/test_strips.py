@@ -69,6 +69,11 @@ class TestCaptureInBands(BaseTester):
         optics.memory_budget = 1 << 40
         assert peak_bytes(lambda: optics(image, depth), image.device) > 1.5 * (64 << 20)
 
+    def test_feature_numbers_of_twice_as_many_bytes_take_twice_the_memory(self):
+        one, two = (read_sample(*make_scene(64, 64, t), make_optics()) for t in (torch.float32, torch.float64))
+        empty = read_sample(*(x[:0] for x in make_scene(64, 64)), make_optics()).bytes_at_once
+        assert two.bytes_at_once - empty == 2 * (one.bytes_at_once - empty) > 0
+
     def test_feature_gradients_take_the_image_at_once(self):
         optics = make_optics(memory_budget=1)
         image, depth = make_scene(150, 40)

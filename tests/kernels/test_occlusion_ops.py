@@ -8,7 +8,12 @@ from typing import Any
 import pytest
 import torch
 
-from kornia_tidy.kernels.occlusion_ops import SOURCE, occlusion_direct, occlusion_direct_gradients
+from kornia_tidy.kernels.occlusion_ops import (
+    SOURCE,
+    count_operations,
+    occlusion_direct,
+    occlusion_direct_gradients,
+)
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import LayeredSceneTester, SceneOperatorTester, needs_compiler
 
@@ -44,6 +49,14 @@ class TestOcclusionDirect(LayeredSceneTester):
         given = scene(layer_weight=torch.ones(1, 11, 34))
         expected = occlusion_direct(**{**given, "layer_index": given["layer_index"] + 1, "layer_weight": None})
         assert torch.equal(occlusion_direct(**given), expected)
+
+    @needs_compiler
+    def test_feature_operations_add_up_over_images_and_grow_with_outlines(self):
+        psfs, columns = torch.zeros(3, 1, 5, 5), torch.arange(68)
+        wide, narrow, weight = (x.float().expand(1, 36, 68) for x in (columns // 2 % 2, columns % 2, columns / 68))
+        one, two = (count_operations(wide, weight, psfs, batch) for batch in (1, 2))
+        assert two == 2 * one
+        assert count_operations(narrow, None, psfs, 1) > count_operations(wide, None, psfs, 1)
 
     @pytest.mark.parametrize(
         ("changes", "error", "words"),

@@ -14,6 +14,7 @@ from kornia_tidy.psf import Pupil, exact_psf_bank
 from kornia_tidy.psf.propagation import gauss_legendre_order
 from tests.base import BaseTester
 from tests.masks.registry import ONE_MASK
+from tests.simulated_device import SimulatedDevice
 
 
 def brute_force(height: np.ndarray, psi: float, wavelength: float, window: int, step: float, samples: int, sub: int):
@@ -167,6 +168,14 @@ class TestExactBank(BaseTester):
         optics = TiDyOptics(PixelwiseMask(1), camera, fidelity=settings_)
         optics.psf_bank().psfs.square().sum().backward()
         assert float(optics.masks.phase.grad.abs().max()) > 0
+
+    def test_feature_matrices_remembered_on_an_accelerator_are_those_of_the_lens(self):
+        masks = torch.rand(2, 7, 7, generator=torch.Generator().manual_seed(3)), torch.tensor([0.4, 0.6])
+        for step, pitch in ((2e-7, 0.3), (3e-7, 0.3), (3e-7, 0.25)):
+            lens = Pupil(torch.ones(7, 7), pitch), Spectrum.monochrome(), [1.0], [3.0], step, 9
+            with SimulatedDevice() as device:
+                found = exact_psf_bank(*map(device.put, masks), *lens).psfs.on_cpu
+            self.assert_close(found, exact_psf_bank(*masks, *lens).psfs, rtol=0, atol=1e-6)
 
     def test_gradcheck_masks_weights_and_pixel_step(self):
         pupil = Pupil(circular_aperture(23), 0.1)

@@ -31,6 +31,8 @@ class TestPSFBank(BaseTester):
         veiled = bank.with_stray_light("veil")
         self.assert_close(veiled.psfs.sum((2, 3)) + veiled.veil, torch.ones(4, 3))
         assert bank.with_stray_light("discard").veil is None
+        assert {x.dtype for x in veiled.to(dtype=torch.float64).present().values()} == {torch.float64}
+        assert torch.equal(veiled.to("cpu").veil, veiled.veil)
 
     def test_feature_a_psf_without_light_stays_finite(self):
         dark = PSFBank(torch.zeros(1, 1, 3, 3), torch.zeros(1), torch.zeros(1, 1)).with_stray_light("renormalize")

@@ -31,6 +31,10 @@ class TestSensor(BaseTester):
             clean = TiDyOptics(optics.masks, sensor=None, fidelity="draft", color_space="linear")(image, depth)
             self.assert_close(optics(image, depth, params=params), clean * (1 + 0.1 * params["grain"]), atol=1e-6)
 
+    def test_feature_noise_is_a_hundredth_of_full_scale_by_default(self):
+        light, params = torch.full((1, 1, 4, 4), 0.5), {"read": torch.ones(1, 1, 4, 4)}
+        self.assert_close(SensorNoise()(light, params=params), light + 0.01)
+
     def test_exception_params_of_another_sensor(self):
         with pytest.raises(ValueError, match=r"params must hold the field 'grain' as draw\(\) returns it, got \[\]"):
             Film()(torch.ones(1, 1, 4, 4), params={})

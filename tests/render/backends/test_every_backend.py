@@ -173,3 +173,5 @@ class TestWork(BaseTester):
         assert works[2] == works[3]
         assert 3 < works[2].operations / works[0].operations < 5  # of four times the pixels
         assert works[0].memory < works[2].memory
+        plane = 4 * image.numel() * (2 if compositing == "occlusion" else 1)  # which computes in float64
+        assert name != "dense" or works[2].memory > 8 * plane  # spectra of light, weights and PSFs among them
