@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import re
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -94,14 +96,22 @@ def public_names() -> dict[str, str]:
 
 def kinds_elsewhere(name: str) -> set[str]:
     """Kinds of the tests in files that are about a name: it stands in two lines or more."""
-    found: set[str] = set()
-    for text in TEXTS:
-        if len(re.findall(rf"^.*\b{name}\b", text, flags=re.MULTILINE)) > 1:
-            found.update(re.findall(r"def test_([a-z]+)", text))
-    return found
+    return set().union(*(kinds for lines, kinds in lines_and_kinds() if lines[name] > 1))
 
 
-TEXTS = [path.read_text() for path in sorted(TESTS.rglob("test_*.py")) if path != Path(__file__)]
+@cache
+def lines_and_kinds() -> list[tuple[Counter[str], set[str]]]:
+    """Of each file: in how many lines each word stands, and the kinds of its tests."""
+    texts = [path.read_text() for path in sorted(TESTS.rglob("test_*.py")) if path != Path(__file__)]
+    return [
+        (
+            Counter(word for line in text.splitlines() for word in set(re.findall(r"\w+", line))),
+            set(re.findall(r"def test_([a-z]+)", text)),
+        )
+        for text in texts
+    ]
+
+
 RECORD = "what a function returns: it checks nothing of its own"
 REFUSES_NOTHING = "takes what functions of the same package made and checked"
 EXEMPT = {
