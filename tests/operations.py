@@ -215,7 +215,7 @@ OPERATIONS = {
     "DepthTap": Operation(
         tapped, error="Expected input of", halves="the container casts masks to the image's type", slow_to_compile=True
     ),
-    "DepthBlur": Operation(with_depth(lambda: ours.DepthBlur(0.6, 4.0, **LENS))),
+    "DepthBlur": Operation(with_depth(lambda: ours.DepthBlur(0.6, 4.0, **LENS)), slow_to_compile=True),
     "LinearCamera": Operation(lambda i: ours.LinearCamera(camera(sensor=None), depth_for(i))),
     "OpticsPipeline": Operation(
         with_depth(lambda: ours.OpticsPipeline(FLIP, camera(sensor=None)), 0),
@@ -234,7 +234,9 @@ OPERATIONS = {
     ),
     "SceneGeometry": Operation(with_depth(lambda: ours.SceneGeometry(FLIP), 0), slow_to_compile=True),
     "bound_depth": Operation(bound_sequence, slow_to_compile=True),
-    "depth_blur": Operation(with_depth(lambda: lambda x, d: ours.depth_blur(x, d, 0.6, 4.0, **LENS))),
+    "depth_blur": Operation(
+        with_depth(lambda: lambda x, d: ours.depth_blur(x, d, 0.6, 4.0, **LENS)), slow_to_compile=True
+    ),
     "fill_holes": Operation(holes, DEPTH, (0.4, 1.4), allows="classes and millimetres may have holes"),
     "sensor_noise": Operation(
         lambda i: (

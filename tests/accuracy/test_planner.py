@@ -262,6 +262,12 @@ class TestPlan(BaseTester):
         assert "states" not in str(other)
         assert plan.operations > 2 * other.operations
 
+    def test_feature_uniform_light_has_no_outlines_where_layers_hide_others(self):
+        optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None, compositing="occlusion")
+        defocus = torch.where(torch.arange(40) < 20, -8.0, 8.0).expand(1, 1, 40, 40)
+        scene = Planner(optics, 3).scene(defocus, torch.full((1, 3, 40, 40), 0.5))
+        assert scene.error(scene.reference.replace(layers="linear", layer_spacing=4.0)) < 1e-3
+
     def test_feature_memory_layout_of_depth_does_not_matter(self):
         depth = torch.linspace(0.4, 3, 48 * 64).view(1, 48, 64)
         optics = TiDyOptics(PixelwiseMask(1, initial="flat"), sensor=None, border="valid")

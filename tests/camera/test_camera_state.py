@@ -285,6 +285,13 @@ class TestAnotherCamera(BaseTester):
             with pytest.raises(ValueError, match="cannot read the camera's settings in the state"):
                 small_twin.load_state_dict({**state, EXTRA: other})
 
+    def test_exception_an_aperture_of_more_pixels_than_are_written(self):
+        state = small(aperture=0.9 * circular_aperture(23, 0.12)).state_dict()
+        saved = read_settings(state[EXTRA])
+        saved["aperture"]["shape"] = [1, (1 << 16) + 1]
+        with pytest.raises(ValueError, match=r"a tensor of \[1, 65537\] is too large for settings"):
+            camera_of_state({**state, EXTRA: write_settings(saved)})
+
     def test_exception_settings_nested_deeper_than_python_can_read(self):
         import zlib
 
