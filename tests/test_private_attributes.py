@@ -58,9 +58,9 @@ def own_objects(function: ast.AST) -> set[str]:
     """Names in a function of the object itself, of its class, and of objects of its class that the function makes."""
     names = {"self", "cls"}
     for node in ast.walk(function):
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
-            if ast.unparse(node.value).startswith(MAKERS):
-                names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+        made = isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+        if made and ast.unparse(node.value).startswith(MAKERS):
+            names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
     return names
 
 
