@@ -18,22 +18,23 @@
 #include <stdlib.h>
 
 #include "vectors.h"
-#include "field.h"
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
 enum { TERMS = 2 * ROWS * WIDTH };        // upper bound of the layers in a block
 enum { TILE_ROWS = 16, TILE_COLUMNS = 256 };  // of pixels that share sums of columns, which stay in the cache
 enum { RUN = 5 };  // terms in adjacent rows that are added together
 
-// The fields of `_Scene` in gather_ops.py. Strides count elements; widths and heights are those of the output.
+// The fields in gather_ops.py. Strides count elements; widths and heights are those of the output.
 typedef struct {
-    int64_t images, channels, height, width, layers, side, threads;
-    int64_t plane_image, plane_channel, plane_row, index_image, index_row, weight_image, weight_row;
+    int64_t threads, images, channels, height, width, layers, side;
     int64_t weight_gradient;    // 0: blend by weights; 1: the next layer less the pixel's own
     const REAL *plane;          // light, larger by side - 1
+    int64_t plane_image, plane_channel, plane_row;
     const REAL *psfs;           // (layers, channels, side, side), flipped, columns first
     const int64_t *index;       // (images, height, width)
+    int64_t index_image, index_row;
     const REAL *weight;         // like index, or null
+    int64_t weight_image, weight_row;
     REAL *out;                  // (images, channels, height, width)
 } scene;
 
@@ -235,13 +236,13 @@ INLINE int mix_block(const scene *s, const terms *t, const desk *d, int64_t pitc
 }
 
 // Gathers light: each pixel is convolved with the PSFs of its layers. A thread takes TILE_ROWS rows of an image at a time, and
-// writes no other. Returns 0, 1 for an invalid layer index, or 2 if there is no memory.
+// writes no other. Returns 0, REFUSED for an invalid layer index, or NO_MEMORY.
 int mix(const scene *s) {
     const int64_t bands = (s->height + TILE_ROWS - 1) / TILE_ROWS, pitch = (TILE_COLUMNS + s->side - 1 + LANES) / LANES * LANES;
     const int64_t plane = (TILE_ROWS + s->side) * pitch;
     int failed = 0;
     terms t = {0};
-    if (!list_terms(s, pitch, &t)) failed = 2;
+    if (!list_terms(s, pitch, &t)) failed = NO_MEMORY;
     else
 #pragma omp parallel num_threads(s->threads)
     {
@@ -250,7 +251,7 @@ int mix(const scene *s) {
         const int taken = d.seen && d.sums && d.total;
         if (!taken) {
 #pragma omp atomic write
-            failed = 2;
+            failed = NO_MEMORY;
         }
 #pragma omp for schedule(dynamic)
         for (int64_t band = 0; band < s->images * bands; band++) {
@@ -267,7 +268,7 @@ int mix(const scene *s) {
                         const int64_t y = least(row, s->height - ROWS), x = least(column, s->width - WIDTH);
                         if (mix_block(s, &t, &d, pitch, image, top, left, y, x, row)) continue;
 #pragma omp atomic write
-                        failed = 1;
+                        failed = REFUSED;
                     }
             }
         }

@@ -5,31 +5,30 @@ The renderer makes the gradients of light and PSFs by the windows of ``overlap_o
 
 from __future__ import annotations
 
-import ctypes
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from kornia_tidy.kernels.build import KERNELS, load
-from kornia_tidy.kernels.operators import Parameters, define
+from kornia_tidy.kernels.operators import call, operator, strided
 from kornia_tidy.kernels.scene_checks import check_smallest, new_pixels, refuse_layer
 from kornia_tidy.kernels.window_sides import size_step
 
 SOURCE = KERNELS / "direct.c"
-NO_LAYER, NO_MEMORY = 1, 2  # status of the functions
 STRIP_ROWS = 4  # of a strip of pixels, see direct.c
 
 
+@operator()
 def gather_direct(
     plane: Tensor,
     psfs: Tensor,
     layer_index: Tensor,
     layer_weight: Tensor | None = None,
-    *,
     correlate: bool = False,
     weight_gradient: bool = False,
-) -> Tensor:
+) -> Iterator[Tensor]:
     r"""Convolve a plane with the PSFs of each pixel's layers and blend them: operator ``kornia_tidy::gather_direct``.
 
     .. math:: I_c = (1 - t) \, (L_c * h_{dc}) + t \, (L_c * h_{d+1,c})
@@ -52,8 +51,14 @@ def gather_direct(
         IndexError: if a pixel lies in no layer.
         NotBuiltError: if the source cannot be compiled.
     """
-    turned = psfs.flip((-2, -1)) if correlate else psfs
-    return torch.ops.kornia_tidy.gather_direct(plane, turned, layer_index, layer_weight, weight_gradient)
+    light = new_pixels(plane, psfs, layer_index, layer_weight, weight_gradient)
+    check_smallest(light.shape, smallest_output(light.dtype))
+    yield light
+    labels = strided(layer_index, 3), strided(layer_weight, 3)
+    planes = strided(plane), (psfs if correlate else psfs.flip((-2, -1))).mT
+    numbers = *light.shape, *psfs.shape[::3], weight_gradient
+    if call(load(SOURCE, light.dtype).mix, *numbers, *planes, *labels, light):
+        refuse_layer(len(psfs))
 
 
 def count_terms(psfs: Tensor) -> int:
@@ -79,46 +84,3 @@ def smallest_output(dtype: torch.dtype) -> tuple[int, int]:
         ((4, 32), (4, 16))
     """
     return STRIP_ROWS, size_step(dtype)
-
-
-class _Scene(Parameters):
-    """The struct ``scene`` in direct.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
-        *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row", "index_image")),
-        *((name, ctypes.c_int64) for name in ("index_row", "weight_image", "weight_row", "weight_gradient")),
-        *((name, ctypes.c_void_p) for name in ("plane", "psfs", "index", "weight", "out")),
-    )
-
-
-def _new_light(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, weight_gradient: bool
-) -> Tensor:
-    light = new_pixels(plane, psfs, layer_index, layer_weight, weight_gradient)
-    check_smallest(light.shape, smallest_output(light.dtype))
-    return light
-
-
-def _gather(
-    plane: Tensor, psfs: Tensor, layer_index: Tensor, layer_weight: Tensor | None, weight_gradient: bool
-) -> Tensor:
-    light = _new_light(plane, psfs, layer_index, layer_weight, weight_gradient)
-    (images, channels, height, width), (layers, side) = light.shape, psfs.shape[::3]
-    numbers = {"images": images, "channels": channels, "height": height, "width": width, "layers": layers, "side": side}
-    scene = _Scene(weight_gradient=weight_gradient, **numbers)
-    scene.point_to(plane=plane, index=layer_index, weight=layer_weight, psfs=psfs.flip((-2, -1)).mT, out=light)
-    status = load(SOURCE, plane.dtype).mix(ctypes.byref(scene))
-    if status == NO_LAYER:
-        refuse_layer(layers)
-    if status == NO_MEMORY:
-        raise MemoryError(f"no memory for PSFs of {side}x{side} pixels")
-    return light
-
-
-define(
-    "gather_direct",
-    "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, bool weight_gradient) -> Tensor",
-    _gather,
-    _new_light,
-)

@@ -107,15 +107,23 @@ INLINE void add_pixels(const vec *pixels, const REAL *gradient, int64_t window, 
     for (; n < plane; n++) add_pixel_part(pixels + n, gradient, window, plane, lines, 1, total + n);
 }
 
+// The fields in mutual_intensity_ops.py: kernels (depths, window, order, cells) and field (states, cells, cells) are complex,
+// weights real, energies, which `gradient` is of, (depths, window, window) real.
+typedef struct {
+    int64_t threads, states, depths, window, order, cells;
+    const REAL *field, *weights, *kernels, *gradient;
+    REAL *out;
+} waves;
+
 // The sizes of one call. Rows of planes are `vecs` vectors of `pitch` numbers.
 typedef struct {
     const REAL *weights;
     int64_t states, depths, window, order, cells, vecs, pitch, waves, rows, plane;
 } sizes;
 
-static sizes sizes_of(const REAL *weights, int64_t states, int64_t depths, int64_t window, int64_t order, int64_t cells) {
-    int64_t vecs = (cells + STEP - 1) / STEP * (STEP / LANES), rows = (cells + BLOCK - 1) / BLOCK * BLOCK;
-    return (sizes){weights, states, depths, window, order, cells, vecs, vecs * LANES, states * order, rows, rows * vecs};
+static sizes sizes_of(const waves *s) {
+    const int64_t vecs = (s->cells + STEP - 1) / STEP * (STEP / LANES), rows = (s->cells + BLOCK - 1) / BLOCK * BLOCK;
+    return (sizes){s->weights, s->states, s->depths, s->window, s->order, s->cells, vecs, vecs * LANES, s->states * s->order, rows, rows * vecs};
 }
 
 // Returns the field with real and imaginary parts of each row by turns, to be freed, or null.
@@ -164,26 +172,25 @@ static void fill_row(const sizes *z, const vec *fields, const REAL *kernel, int6
         }
 }
 
-// kernels (depths, window, order, cells) and field (states, cells, cells) are complex, weights real, energies
-// (depths, window, window) real. Returns 0, or 1 if there is no memory.
-int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels, REAL *energies, int64_t states,
-                    int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
-    const sizes all = sizes_of(weights, states, depths, window, order, cells), *z = &all;
-    vec *fields = alternate(z, field);
-    if (!fields) return 1;
+// Computes the energies. Returns 0 or NO_MEMORY.
+int mutual_energies(const waves *s) {
+    const sizes all = sizes_of(s), *z = &all;
+    const int64_t window = s->window;
+    vec *fields = alternate(z, s->field);
+    if (!fields) return NO_MEMORY;
     int failed = 0;
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-    for (int64_t d = 0; d < depths; d++) {
+#pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
+    for (int64_t d = 0; d < s->depths; d++) {
         int64_t part = z->waves * z->vecs;
         vec *memory = aligned_alloc(sizeof(vec), (4 * part + (window + LINES) * z->plane) * sizeof(vec));
         if (!memory) {
 #pragma omp atomic write
-            failed = 1;
+            failed = NO_MEMORY;
             continue;
         }
         row r = {memory, memory + part, memory + 2 * part, memory + 3 * part};
         vec *intensity = memory + 4 * part, *pixels = intensity + LINES * z->plane;
-        const REAL *kernel = kernels + d * window * order * cells * 2;
+        const REAL *kernel = s->kernels + d * window * s->order * s->cells * 2;
         fill_pixels(z, kernel, r, pixels);
         for (int64_t p = 0, lines; p < window; p += lines) {
             lines = p + LINES <= window ? LINES : 1;
@@ -191,7 +198,7 @@ int mutual_energies(const REAL *field, const REAL *weights, const REAL *kernels,
                 fill_row(z, fields, kernel, p + i, r);
                 products(r.re, r.im, r.one, r.two, z->waves, z->rows, z->vecs, intensity + i * z->plane);
             }
-            REAL *light = energies + (d * window + p) * window;
+            REAL *light = s->out + (d * window + p) * window;
             if (lines == LINES) add_lines(intensity, pixels, z->plane, LINES, window, light);
             else add_lines(intensity, pixels, z->plane, 1, window, light);
         }
@@ -260,16 +267,17 @@ static void add_depth_gradient(const sizes *z, const vec *fields, const REAL *ke
 }
 
 // The gradient of the field, complex like it, from that of the energies. Depths are summed in slabs, one for each thread.
-// Returns 0, or 1 if there is no memory.
-int mutual_field_gradient(const REAL *field, const REAL *weights, const REAL *kernels, const REAL *gradient, REAL *out,
-                          int64_t states, int64_t depths, int64_t window, int64_t order, int64_t cells, int64_t threads) {
-    const sizes all = sizes_of(weights, states, depths, window, order, cells), *z = &all;
+// Returns 0 or NO_MEMORY.
+int mutual_field_gradient(const waves *s) {
+    const sizes all = sizes_of(s), *z = &all;
+    const int64_t states = s->states, depths = s->depths, window = s->window, order = s->order, cells = s->cells, threads = s->threads;
+    REAL *out = s->out;
     const int64_t slabs = least(threads, depths), part = z->waves * z->vecs, points = window * order * z->vecs;
     const int64_t each[] = {4 * part, window * z->plane, LINES * z->plane, 2 * cells * z->vecs, 2 * z->vecs,
                             3 * states * points, 2 * points, 2 * states * z->plane};
     int64_t size = 0;
     for (int n = 0; n < 8; n++) size += each[n];
-    vec *fields = alternate(z, field), *memory = aligned_alloc(sizeof(vec), (slabs * size + 1) * sizeof(vec));
+    vec *fields = alternate(z, s->field), *memory = aligned_alloc(sizeof(vec), (slabs * size + 1) * sizeof(vec));
     if (fields && memory) {
         memset(memory, 0, slabs * size * sizeof(vec));
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
@@ -279,7 +287,7 @@ int mutual_field_gradient(const REAL *field, const REAL *weights, const REAL *ke
             desk d = {{at[0], at[0] + part, at[0] + 2 * part, at[0] + 3 * part}, at[1], at[2], at[3], (REAL *)at[4], at[5],
                       at[5] + states * points, at[5] + 2 * states * points, at[6], at[6] + points, at[7]};
             for (int64_t n = depths * slab / slabs; n < depths * (slab + 1) / slabs; n++)
-                add_depth_gradient(z, fields, kernels + n * window * order * cells * 2, gradient + n * window * window, &d);
+                add_depth_gradient(z, fields, s->kernels + n * window * order * cells * 2, s->gradient + n * window * window, &d);
         }
         for (int64_t m = 0; m < states * cells * cells * 2; m++) {
             int64_t n = m / 2, plane = (n / cells / cells * 2 + m % 2) * z->plane;
@@ -288,7 +296,7 @@ int mutual_field_gradient(const REAL *field, const REAL *weights, const REAL *ke
             for (int64_t slab = 0; slab < slabs; slab++) out[m] += ((const REAL *)(memory + slab * size))[place];
         }
     }
-    int failed = !fields || !memory;
+    const int failed = fields && memory ? 0 : NO_MEMORY;
     free(fields), free(memory);
     return failed;
 }

@@ -33,11 +33,13 @@ typedef REAL part __attribute__((vector_size(DOUBLES * sizeof(REAL))));
 
 static const REAL EPSILON = 1e-6;  // as in dense_occlusion.py
 
-// The fields of `_Scene` in occlusion_ops.py. Widths and heights are those of the output; planes are larger by side - 1.
+// The fields of `_fields` in occlusion_ops.py, and more. Widths and heights are those of the output; planes are larger by
+// side - 1.
 typedef struct {
-    int64_t images, channels, height, width, layers, side, threads;
-    int64_t plane_image, plane_channel, plane_row, map_image, map_row;
+    int64_t threads, images, channels, height, width, layers, side, map_image, map_row;
+    field over;         // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
     const REAL *plane;  // light
+    int64_t plane_image, plane_channel, plane_row;
     const REAL *psfs;   // (layers, channels, side, side), flipped, columns first
     const REAL *lower;  // layer indices of the plane's pixels; `layers` or more: in no layer
     const REAL *share;  // weight of the next layer, below 1; like lower, or null
@@ -45,8 +47,8 @@ typedef struct {
     const REAL *veil;   // (layers, channels) share of stray light
     REAL *out;          // (images, channels, height, width)
     const REAL *gradient;  // of `out`
-    REAL *psf_gradient, *veil_gradient, *plane_gradient, *mean_gradient;  // of the tensors, like them, or null
-    field over;         // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
+    REAL *plane_gradient, *psf_gradient, *mean_gradient, *veil_gradient;  // of the tensors, like them, or null
+    int64_t *counts, every;  // see `count`
 } scene_parameters;
 
 // A run of pixels of one row with the same layer index; either all or none of them are shared with the next layer.
@@ -625,8 +627,9 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
 
 // Counts the operations of every `every`-th band as of vectors of 64 bytes, which costs are known for. Only what a pair
 // takes, the outline of a layer and its masks, is as much for narrow vectors. Returns 0, or 1 if there is no memory.
-int count(const scene_parameters *s, int64_t every, int64_t *counts) {
-    int64_t bands = s->images * bands_of(s);
+int count(const scene_parameters *s) {
+    const int64_t bands = s->images * bands_of(s), every = s->every;
+    int64_t *counts = s->counts;
     workspace d;
     int ok = allocate_workspace(s, &d);
     for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);

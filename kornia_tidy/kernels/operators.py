@@ -1,4 +1,4 @@
-"""Operators of torch in C: their definition, and the structs that they hand to C.
+"""Operators of torch in C: their definition, the checks of their tensors, and the structs that they hand to C.
 
 Operators are defined by schema, as ``torch.library.custom_op`` would import the compiler on the first call (3 s).
 """
@@ -6,11 +6,70 @@ Operators are defined by schema, as ``torch.library.custom_op`` would import the
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+import inspect
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+
+NO_MEMORY, REFUSED = 1, 2  # status of functions in C: REFUSED is of values that they cannot use
+
+_TYPES = {
+    "int": "SymInt",
+    "Tensor | None": "Tensor?",
+    "Sequence[Tensor]": "Tensor[]",
+    "Sequence[Tensor] | None": "Tensor[]?",
+    "Sequence[bool]": "bool[]",
+}
+_RESULTS = {"Tensor": "Tensor", "list[Tensor]": "Tensor[]", "tuple[Tensor, Tensor]": "(Tensor, Tensor)"}
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+
+
+def operator(
+    backward: Callable[..., Any] | None = None, keep: Callable[..., None] | None = None
+) -> Callable[[Callable[Given, Iterator[Result]]], Callable[Given, Result]]:
+    """Make a generator function an operator on processors ``kornia_tidy::<name>``, with the schema of its annotations.
+
+    It checks its arguments and yields the memory of its result, which is all that tensors without memory ask for. Then
+    it fills the memory.
+
+    Args:
+        backward: as for :func:`define`.
+        keep: as there.
+
+    Example:
+        >>> from kornia_tidy.kernels.gather_ops import gather_direct
+        >>> gather_direct.name(), str(gather_direct._schema)[-56:]
+        ('kornia_tidy::gather_direct', 'bool correlate=False, bool weight_gradient=False) -> Tensor')
+    """
+
+    def defined(function: Any) -> Any:
+        name = function.__name__.lstrip("_")
+
+        def fake(*given: Any) -> Any:
+            return next(function(*given))
+
+        def compute(*given: Any) -> Any:
+            (result,) = function(*given)
+            return result
+
+        define(name, _schema(function), compute, fake, backward, keep)
+        return getattr(torch.ops.kornia_tidy, name).default
+
+    return defined
+
+
+def _schema(function: Callable[..., Any]) -> str:
+    signature = inspect.signature(function)
+    arguments = (
+        f"{_TYPES.get(x.annotation, x.annotation)} {name}{'' if x.default is x.empty else f'={x.default}'}"
+        for name, x in signature.parameters.items()
+    )
+    return f"({', '.join(arguments)}) -> {_RESULTS[signature.return_annotation[len('Iterator[') : -1]]}"
 
 
 def define(
@@ -73,28 +132,69 @@ def differentiable_gradients(
     return [next(each) if want and x is not None else None for x, want in zip(own, wanted, strict=True)]
 
 
-class Parameters(ctypes.Structure):
-    """A struct of C. It keeps the tensors whose memory it names. Its field ``threads`` is filled in."""
+def check(sizes: dict[str, int], dtype: torch.dtype | None, **tensors: tuple[Tensor | None, str]) -> None:
+    """Refuse tensors of another data type, or whose axes are not of one size wherever they have one name.
 
-    def __init__(self, **numbers: int) -> None:
-        super().__init__(threads=torch.get_num_threads(), **numbers)
-        self.kept: list[Tensor] = []
+    Args:
+        sizes: of axes by name. Those that are new are added.
+        dtype: of all; None: any.
+        tensors: by name, each with the names of its axes. None has no axes.
 
-    def point_to(self, **tensors: Tensor | None) -> None:
-        """Write addresses of tensors to the fields of their names, and strides where there are fields for them.
+    Raises:
+        TypeError: if a data type differs.
+        ValueError: if a shape does not fit.
 
-        Strides of ``plane`` are ``plane_image``, ``plane_channel`` and ``plane_row``: pixels of a row lie side by side.
-        Tensors without such fields are contiguous.
-        """
-        fields = {field[0] for field in self._fields_}
-        for name, tensor in tensors.items():
-            if tensor is None:
-                continue
-            strided = f"{name}_row" in fields
-            own = tensor if strided and tensor.stride(-1) == 1 else tensor.contiguous()
-            setattr(self, name, own.data_ptr())
-            self.kept.append(own)
-            if strided:
-                axes = ("image", "channel", "row") if own.ndim == 4 else ("image", "row")
-                for axis, stride in zip(axes, own.stride(), strict=False):
-                    setattr(self, f"{name}_{axis}", stride)
+    Example:
+        >>> sizes = {"B": 2}
+        >>> check(sizes, torch.float32, image=(torch.ones(2, 5), "B N"))
+        >>> check(sizes, None, mean=(torch.ones(3), "N"))
+        Traceback (most recent call last):
+        ValueError: mean must have shape (5), got (3,)
+    """
+    for name, (tensor, axes) in tensors.items():
+        if tensor is None:
+            continue
+        if dtype not in {None, tensor.dtype}:
+            raise TypeError(f"{name} must be {dtype}, got {tensor.dtype}")
+        names = axes.split()
+        sizes |= {axis: int(axis) for axis in names if axis.isdigit()}
+        wanted = [sizes.get(axis, axis) for axis in names]
+        pairs = zip(names, tensor.shape, strict=False)
+        if tensor.ndim != len(names) or any(sizes.setdefault(axis, n) != n for axis, n in pairs):
+            raise ValueError(f"{name} must have shape ({', '.join(map(str, wanted))}), got {tuple(tensor.shape)}")
+
+
+def strided(tensor: Tensor | None, axes: int = 4) -> tuple[Any, ...]:
+    """Return a tensor whose rows are dense with its strides along the other axes: as many fields for :func:`call`.
+
+    Example:
+        >>> strided(torch.ones(3, 5).T.expand(2, -1, -1))[1:], strided(None, 3)
+        ((0, 3), (None, 0, 0))
+    """
+    if tensor is None:
+        return None, *(0,) * (axes - 1)
+    own = tensor if tensor.stride(-1) == 1 else tensor.contiguous()
+    return own, *own.stride()[:-1]
+
+
+def call(function: Any, *fields: Tensor | float | tuple[Any, ...] | None) -> int:
+    """Call a function in C with the address of a struct, and return its status.
+
+    Args:
+        function: of a library.
+        fields: of the struct after the first one, which is the number of threads. All are of 64 bits: whole numbers,
+            double ones, and pointers to contiguous tensors or to those of :func:`strided`. None is a null pointer.
+
+    Raises:
+        MemoryError: if memory is missing.
+    """
+    kept: list[Any] = []
+    for x in fields:
+        kept += x if isinstance(x, tuple) else [x.contiguous() if isinstance(x, Tensor) else x]
+    words = [x.data_ptr() if isinstance(x, Tensor) else x or 0 for x in kept]
+    kinds = "".join("d" if isinstance(x, float) else "q" for x in words)
+    status = function(ctypes.c_char_p(struct.pack(f"q{kinds}", torch.get_num_threads(), *words)))
+    if status == NO_MEMORY:
+        shapes = ", ".join(str(tuple(x.shape)) for x in kept if isinstance(x, Tensor))
+        raise MemoryError(f"there is no memory for {function.__name__} of tensors of shapes {shapes}")
+    return status

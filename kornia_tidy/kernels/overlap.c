@@ -31,20 +31,22 @@ typedef struct {
     vec re, im;
 } wave;
 
-// The fields of `_Tiles` in overlap_ops.py. Strides count elements; width and height are those of the labelled pixels.
+// The fields of `_fill` in overlap_ops.py. Strides count elements; width and height are those of the labelled pixels.
 typedef struct {
-    int64_t images, channels, height, width, layers, side, threads;
+    int64_t threads, images, channels, height, width, layers, side;
     int64_t rows, columns;         // samples of a window: multiples of LANES and of 2 * LANES, products of 2, 3 and 5
     int64_t origin;                // row and column of a window at which its tile begins: 0 or side - 1
     int64_t correlate;             // 1: with PSFs flipped by 180 degrees
     int64_t weight_gradient;       // 0: blend by weights; 1: the next layer less the pixel's own
-    int64_t plane_image, plane_channel, plane_row, pixels_image, pixels_channel, pixels_row;
-    int64_t index_image, index_row, weight_image, weight_row;
-    const REAL *psfs;              // (layers, channels, side, side); not for the gradient of the PSFs
-    const int64_t *index;          // (images, height, width)
-    const REAL *weight;            // like index, or null
     const REAL *plane;             // (images, channels, height + side - 1, width + side - 1); not for scatter
+    int64_t plane_image, plane_channel, plane_row;
     const REAL *pixels;            // (images, channels, height, width); not for gather
+    int64_t pixels_image, pixels_channel, pixels_row;
+    const int64_t *index;          // (images, height, width)
+    int64_t index_image, index_row;
+    const REAL *weight;            // like index, or null
+    int64_t weight_image, weight_row;
+    const REAL *psfs;              // (layers, channels, side, side); not for the gradient of the PSFs
     REAL *out;                     // gather: as pixels; scatter: as the plane, zeros; gradient: as the PSFs, zeros
     field over;                    // psfs with nodes: (node_rows, node_columns, layers, channels, side, side)
 } tiles;
@@ -843,7 +845,7 @@ static void free_desk(desk *d) {
 // Computes in memory that was taken. Returns as the functions below.
 static int compute_in(work *w, desk *desks, int kind) {
     const tiles *s = w->s;
-    if (!note_layers(w)) return 1;
+    if (!note_layers(w)) return REFUSED;
     plan(&w->in_columns, s->rows, plan(&w->in_rows, w->waves, w->numbers));
     for (int64_t j = 0; j < w->waves; j++) {
         w->turns[j / LANES].re[j % LANES] = cos(M_PI * (double)j / (double)s->columns);
@@ -853,7 +855,7 @@ static int compute_in(work *w, desk *desks, int kind) {
     const field *f = &s->over;
     if (!f->node_rows) w->psfs = take(slabs * present * w->bands * w->waves, sizeof(wave));
     else w->psfs = take(kind == CORRELATE ? slabs * f->node_rows * f->node_columns * s->layers * desks->lines.vectors : 0, sizeof(vec));
-    if (!w->psfs) return 2;
+    if (!w->psfs) return NO_MEMORY;
     for (int64_t channel = 0; channel < s->channels; channel++) {
         if (kind == CORRELATE && f->node_rows) correlate_rows(w, channel, desks);
         else if (kind == CORRELATE) correlate_tiles(w, channel, desks, present);
@@ -893,7 +895,7 @@ static int compute(const tiles *s, int kind) {
     desk *desks = calloc(s->threads, sizeof(desk));
     int taken = desks && w.row_edges && w.column_edges && w.numbers && w.turns && w.place && w.needed;
     for (int64_t n = 0; taken && n < s->threads; n++) taken = take_desk(&w, desks + n);
-    const int failed = taken ? compute_in(&w, desks, kind) : 2;
+    const int failed = taken ? compute_in(&w, desks, kind) : NO_MEMORY;
     for (int64_t n = 0; desks && n < s->threads; n++) free_desk(desks + n);
     free(desks);
     free(w.numbers);
@@ -905,7 +907,7 @@ static int compute(const tiles *s, int kind) {
     return failed;
 }
 
-// Return 0, 1 if a pixel lies in no layer, 2 if there is no memory.
+// Return 0, REFUSED if a pixel lies in no layer, or NO_MEMORY.
 int gather(const tiles *s) { return compute(s, GATHER); }
 
 int scatter(const tiles *s) { return compute(s, SCATTER); }

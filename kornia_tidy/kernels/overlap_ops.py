@@ -13,23 +13,20 @@ tile, to first order.
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from itertools import count
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, load
-from kornia_tidy.kernels.operators import Parameters, define
-from kornia_tidy.kernels.places import PLACES, Places, check_places, of_axis, parameters_of
+from kornia_tidy.kernels.operators import call, operator, strided
+from kornia_tidy.kernels.places import Places, check_places, fields_of, of_axis
 from kornia_tidy.kernels.scene_checks import new_pixels, new_plane, new_psfs, refuse_layer
 from kornia_tidy.kernels.window_sides import is_window_size, needed_side, size_step
 
 SOURCE = KERNELS / "overlap.c"
-NO_LAYER, NO_MEMORY = 1, 2  # status of the functions
 
 
 @cache
@@ -47,17 +44,17 @@ def window_size(psf_side: int) -> int:
     return next(size for size in sizes if is_window_size(size, torch.float32))
 
 
+@operator()
 def gather_overlap(
     plane: Tensor,
     psfs: Tensor,
     layer_index: Tensor,
     layer_weight: Tensor | None,
     size: int,
-    *,
     correlate: bool = False,
     weight_gradient: bool = False,
-    places: Sequence[Tensor] = (),
-) -> Tensor:
+    places: Sequence[Tensor] | None = None,
+) -> Iterator[Tensor]:
     r"""Convolve a plane with the PSFs of each pixel's layers and blend them: operator ``kornia_tidy::gather_overlap``.
 
     .. math:: I_c = (1 - t) \, (L_c * h_{dc}) + t \, (L_c * h_{d+1,c})
@@ -85,21 +82,23 @@ def gather_overlap(
         MemoryError: if memory for the spectra is missing.
         NotBuiltError: if the source cannot be compiled.
     """
-    return torch.ops.kornia_tidy.gather_overlap(
-        plane, psfs, layer_index, layer_weight, size, correlate, weight_gradient, list(places)
-    )
+    pixels = new_pixels(plane, of_axis(psfs, places), layer_index, layer_weight, weight_gradient)
+    _check_size(size, psfs.shape[-1], psfs.dtype)
+    yield pixels
+    labels, options = (layer_index, layer_weight), (correlate, weight_gradient)
+    _fill("gather", pixels, psfs.shape[-4:], labels, size, *options, places, plane=plane, psfs=psfs)
 
 
+@operator()
 def scatter_overlap(
     pixels: Tensor,
     psfs: Tensor,
     layer_index: Tensor,
     layer_weight: Tensor | None,
     size: int,
-    *,
     correlate: bool = False,
-    places: Sequence[Tensor] = (),
-) -> Tensor:
+    places: Sequence[Tensor] | None = None,
+) -> Iterator[Tensor]:
     """Spread the light of pixels by the PSFs of their layers: the transpose of :func:`gather_overlap`, by overlap-add.
 
     Args:
@@ -116,10 +115,14 @@ def scatter_overlap(
         (B, C, H + P - 1, W + P - 1) light, added in the same order every time. It has no gradient. Errors are those of
         :func:`gather_overlap`.
     """
-    labels = layer_index, layer_weight
-    return torch.ops.kornia_tidy.scatter_overlap(pixels, psfs, *labels, size, correlate, list(places))
+    plane = new_plane(pixels, of_axis(psfs, places), layer_index, layer_weight)
+    _check_size(size, psfs.shape[-1], psfs.dtype)
+    yield plane
+    labels, options = (layer_index, layer_weight), (correlate, False)
+    _fill("scatter", plane, psfs.shape[-4:], labels, size, *options, places, pixels=pixels, psfs=psfs)
 
 
+@operator()
 def overlap_psf_gradient(
     plane: Tensor,
     pixels: Tensor,
@@ -127,10 +130,9 @@ def overlap_psf_gradient(
     layer_weight: Tensor | None,
     layers: int,
     size: int,
-    *,
     correlate: bool = False,
-    places: Sequence[Tensor] = (),
-) -> Tensor:
+    places: Sequence[Tensor] | None = None,
+) -> Iterator[Tensor]:
     """Correlate a plane with each layer's pixels: the gradient of :func:`gather_overlap` with respect to the PSFs.
 
     Args:
@@ -147,64 +149,15 @@ def overlap_psf_gradient(
         (D, C, P, P), or with ``places`` (I, J, D, C, P, P), added in the same order every time with as many threads. It
         has no gradient. Errors are those of :func:`gather_overlap`.
     """
-    labels = layer_index, layer_weight
-    return torch.ops.kornia_tidy.overlap_psf_gradient(plane, pixels, *labels, layers, size, correlate, list(places))
-
-
-class _Tiles(Parameters):
-    """The struct ``tiles`` in overlap.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("images", "channels", "height", "width", "layers", "side", "threads")),
-        *((name, ctypes.c_int64) for name in ("rows", "columns", "origin", "correlate", "weight_gradient")),
-        *((name, ctypes.c_int64) for name in ("plane_image", "plane_channel", "plane_row")),
-        *((name, ctypes.c_int64) for name in ("pixels_image", "pixels_channel", "pixels_row")),
-        *((name, ctypes.c_int64) for name in ("index_image", "index_row", "weight_image", "weight_row")),
-        *((name, ctypes.c_void_p) for name in ("psfs", "index", "weight", "plane", "pixels", "out")),
-        *PLACES,
-    )
-
-
-def _call(
-    function: str,
-    out: Tensor,
-    like_psfs: Tensor,
-    labels: tuple[Tensor, Tensor | None],
-    size: int,
-    correlate: bool,
-    weight_gradient: bool,
-    places: list[Tensor],
-    **tensors: Tensor,
-) -> Tensor:
-    """Call a function of overlap.c that writes to ``out``, and return it."""
-    (images, height, width), (layers, channels, side, _) = labels[0].shape, like_psfs.shape[-4:]
-    step, largest, own = size_step(out.dtype), (height, width), {}
+    found = new_psfs(plane, pixels, layer_index, layer_weight, layers)
+    _check_size(size, found.shape[-1], found.dtype)
     if places:
-        most = size - side + 1
-        own, more = parameters_of(places, (height, width), (most, most), out.dtype)
-        largest = int(more["row_edges"].diff().max()), int(more["column_edges"].diff().max())
-        tensors |= more
-    tiles = _Tiles(
-        images=images,
-        channels=channels,
-        height=height,
-        width=width,
-        layers=layers,
-        side=side,
-        rows=needed_side(size, largest[0], side, step // 2),
-        columns=needed_side(size, largest[1], side, step),
-        origin=(side - 1) * (correlate == (function == "scatter")),
-        correlate=correlate,
-        weight_gradient=weight_gradient,
-        **own,
-    )
-    tiles.point_to(index=labels[0], weight=labels[1], out=out, **tensors)
-    status = getattr(load(SOURCE, out.dtype), function)(ctypes.byref(tiles)) if images and out.numel() else 0
-    if status == NO_LAYER:
-        refuse_layer(layers)
-    if status == NO_MEMORY:
-        raise MemoryError(f"no memory for the spectra of {layers} PSFs in windows of {size}x{size} samples")
-    return out
+        nodes = Places(*places).row_weights.shape[-1], Places(*places).column_weights.shape[-1]
+        check_places(places, nodes)
+        found = found.new_zeros(*nodes, *found.shape)
+    yield found
+    labels, options = (layer_index, layer_weight), (correlate, False)
+    _fill("correlate", found, found.shape[-4:], labels, size, *options, places, plane=plane, pixels=pixels)
 
 
 def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
@@ -215,90 +168,29 @@ def _check_size(size: int, side: int, dtype: torch.dtype) -> None:
         )
 
 
-def _new_pixels(
-    plane: Tensor,
-    psfs: Tensor,
-    index: Tensor,
-    weight: Tensor | None,
+def _fill(
+    function: str,
+    out: Tensor,
+    of_psfs: Sequence[int],
+    labels: tuple[Tensor, Tensor | None],
     size: int,
     correlate: bool,
     weight_gradient: bool,
-    places: list[Tensor],
-) -> Tensor:
-    out = new_pixels(plane, of_axis(psfs, places), index, weight, weight_gradient)
-    _check_size(size, psfs.shape[-1], psfs.dtype)
-    return out
-
-
-def _new_plane(
-    pixels: Tensor,
-    psfs: Tensor,
-    index: Tensor,
-    weight: Tensor | None,
-    size: int,
-    correlate: bool,
-    places: list[Tensor],
-) -> Tensor:
-    out = new_plane(pixels, of_axis(psfs, places), index, weight)
-    _check_size(size, psfs.shape[-1], psfs.dtype)
-    return out
-
-
-def _new_psfs(
-    plane: Tensor,
-    pixels: Tensor,
-    index: Tensor,
-    weight: Tensor | None,
-    layers: int,
-    size: int,
-    correlate: bool,
-    places: list[Tensor],
-) -> Tensor:
-    out = new_psfs(plane, pixels, index, weight, layers)
-    _check_size(size, out.shape[-1], out.dtype)
-    if not places:
-        return out
-    nodes = Places(*places).row_weights.shape[-1], Places(*places).column_weights.shape[-1]
-    check_places(places, nodes)
-    return out.new_zeros(*nodes, *out.shape)
-
-
-def _gather(plane: Tensor, psfs: Tensor, *rest: Any) -> Tensor:
-    index, weight, *options = rest
-    out = _new_pixels(plane, psfs, *rest)
-    return _call("gather", out, psfs, (index, weight), *options, plane=plane, psfs=psfs)
-
-
-def _scatter(pixels: Tensor, psfs: Tensor, *rest: Any) -> Tensor:
-    index, weight, size, correlate, places = rest
-    out = _new_plane(pixels, psfs, *rest)
-    return _call("scatter", out, psfs, (index, weight), size, correlate, False, places, pixels=pixels, psfs=psfs)
-
-
-def _psf_gradient(plane: Tensor, pixels: Tensor, *rest: Any) -> Tensor:
-    index, weight, _, size, correlate, places = rest
-    out = _new_psfs(plane, pixels, *rest)
-    return _call("correlate", out, out, (index, weight), size, correlate, False, places, plane=plane, pixels=pixels)
-
-
-define(
-    "gather_overlap",
-    "(Tensor plane, Tensor psfs, Tensor layer_index, Tensor? layer_weight, SymInt size, bool correlate,"
-    " bool weight_gradient, Tensor[] places) -> Tensor",
-    _gather,
-    _new_pixels,
-)
-define(
-    "scatter_overlap",
-    "(Tensor pixels, Tensor psfs, Tensor layer_index, Tensor? layer_weight, SymInt size, bool correlate,"
-    " Tensor[] places) -> Tensor",
-    _scatter,
-    _new_plane,
-)
-define(
-    "overlap_psf_gradient",
-    "(Tensor plane, Tensor pixels, Tensor layer_index, Tensor? layer_weight, SymInt layers, SymInt size,"
-    " bool correlate, Tensor[] places) -> Tensor",
-    _psf_gradient,
-    _new_psfs,
-)
+    places: Sequence[Tensor] | None,
+    plane: Tensor | None = None,
+    pixels: Tensor | None = None,
+    psfs: Tensor | None = None,
+) -> None:
+    """Call a function of overlap.c that writes to ``out``, from PSFs (..., D, C, P, P)."""
+    (images, height, width), (layers, channels, side, _) = labels[0].shape, of_psfs
+    if not out.numel() or not images:
+        return
+    step, most = size_step(out.dtype), size - side + 1
+    field = fields_of(places, (height, width), (most, most), out.dtype)
+    largest = [int(edges.diff().max()) for edges in field[4:6]] if places else (height, width)
+    window = needed_side(size, largest[0], side, step // 2), needed_side(size, largest[1], side, step)
+    origin = (side - 1) * (correlate == (function == "scatter"))
+    numbers = images, channels, height, width, layers, side, *window, origin, correlate, weight_gradient
+    light, layer = (strided(plane), strided(pixels)), (strided(labels[0], 3), strided(labels[1], 3))
+    if call(getattr(load(SOURCE, out.dtype), function), *numbers, *light, *layer, psfs, out, *field):
+        refuse_layer(layers)

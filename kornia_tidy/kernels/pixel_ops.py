@@ -22,8 +22,7 @@ Source: IEC 61966-2-1.
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -31,7 +30,7 @@ from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, REALS, compiled, load
-from kornia_tidy.kernels.operators import define, differentiable_gradients
+from kornia_tidy.kernels.operators import call, differentiable_gradients, operator
 from kornia_tidy.kernels.shot_noise import drawn_electrons
 from kornia_tidy.mode import Mode, torch_mode
 
@@ -78,7 +77,7 @@ def _goes_in_c(x: Tensor) -> bool:
 
 
 def _convert(image: Tensor, encode: bool) -> Tensor:
-    return torch.ops.kornia_tidy.srgb(image, encode) if _goes_in_c(image) else _convert_by_torch(image, encode)
+    return _srgb(image, encode) if _goes_in_c(image) else _convert_by_torch(image, encode)
 
 
 def _convert_by_torch(image: Tensor, encode: bool) -> Tensor:
@@ -124,7 +123,7 @@ def record(
     fields, numbers = (shot, read, offset), (full_well, dark, sigma)
     learnt = any(isinstance(x, Tensor) and x.requires_grad for x in (*fields, *numbers))
     if _goes_in_c(light) and not learnt:
-        return torch.ops.kornia_tidy.record(light, *fields, *map(float, numbers), bits or 0, clip)
+        return _record(light, *fields, float(full_well), float(dark), float(sigma), bits or 0, clip)
     return _record_by_torch(light, *fields, *numbers, bits, clip)
 
 
@@ -162,88 +161,62 @@ def quantized(value: Tensor, bits: int) -> Tensor:
 # ---------------------------------------------------------------------- the operators
 
 
-def _define(name: str, schema: str, tensors: int, call: Callable[..., Tensor], by_torch: Callable[..., Tensor]) -> None:
-    """Define an operator ``kornia_tidy::<name>`` of a first tensor, with its gradient ``kornia_tidy::<name>_gradient``.
-
-    Args:
-        name: of the operator.
-        schema: its arguments. The first is a tensor; the gradient's operator has that of its result after it.
-        tensors: how many arguments are tensors; they come first. Gradients reach the first.
-        call: fills the memory of the result, which comes first, from the first tensor, the gradient of the result or
-            None, and all other arguments.
-        by_torch: the same by plain operations, of the operator's arguments, to differentiate the gradient in turn.
-    """
-    first, _, rest = schema.partition(", ")
-    of_gradient = f"{name}_gradient"
-
-    def new(x: Tensor, *given: Any) -> Tensor:
-        """Check the arguments and return the memory of the result, which is also the fake implementation."""
-        if x.dtype not in REALS:
-            raise TypeError(f"{first.split()[1]} must be float32 or float64, got {x.dtype}")
-        for field in given:
-            if isinstance(field, Tensor) and (field.dtype, field.shape) != (x.dtype, x.shape):
-                raise ValueError(
-                    f"fields must be {x.dtype} of shape {tuple(x.shape)} as the {first.split()[1]}, got {field.dtype} "
-                    f"of shape {tuple(field.shape)}"
-                )
-        return torch.empty_like(x)
-
-    def gradient_of(x: Tensor, gradient: Tensor, *given: Any) -> Tensor:
-        return call(new(x, gradient, *given), x, gradient, *given)
-
-    def keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs[:tensors])
-        ctx.options = inputs[tensors:]
-
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, *fields = ctx.saved_tensors
-        given = *fields, *ctx.options
-        if not torch.is_grad_enabled():
-            return getattr(torch.ops.kornia_tidy, of_gradient)(x, gradient, *given), *[None] * len(given)
-        gradients = differentiable_gradients(lambda own: by_torch(own, *given), [x], gradient, [True])
-        return *gradients, *[None] * len(given)
-
-    schemas = f"({schema}) -> Tensor", f"({first}, Tensor gradient, {rest}) -> Tensor"
-    define(name, schemas[0], lambda x, *given: call(new(x, *given), x, None, *given), new, backward, keep)
-    define(of_gradient, schemas[1], gradient_of, new)
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    *given, ctx.gradient = inputs
+    ctx.options = [None if isinstance(x, Tensor) else x for x in given]
+    ctx.save_for_backward(*(x if isinstance(x, Tensor) else None for x in given))
 
 
-def _call(function: Callable[..., Any], out: Tensor, given: Sequence[Tensor | None], *numbers: float) -> Tensor:
-    """Fill a tensor by a function of C, and return it.
-
-    Args:
-        function: takes the addresses of the given tensors and of ``out``, the count of their numbers, the other
-            arguments, and the number of threads.
-        out: dense, of float32 or float64.
-        given: of its shape and type, in any order of memory. None is a null pointer.
-        numbers: floats and whole numbers for the function.
-    """
-    ordered = [None if x is None else _in_order(x, out) for x in given]
-    function(
-        *(ctypes.c_void_p(None if x is None else x.data_ptr()) for x in (*ordered, out)),
-        ctypes.c_int64(out.numel()),
-        *(ctypes.c_double(x) if isinstance(x, float) else ctypes.c_int64(x) for x in numbers),
-        ctypes.c_int64(torch.get_num_threads()),
-    )
-    return out
+def _backward(ctx: Any, gradient: Tensor, by_operator: Callable[..., Tensor], by_torch: Callable[..., Tensor]) -> Any:
+    """Return the gradient of an operator's first argument; the last one is none, or it has been a gradient's."""
+    if ctx.gradient is not None:
+        raise NotImplementedError(
+            "a gradient has no gradient here: differentiate functions of kornia_tidy.sensor instead"
+        )
+    x, *given = (option if x is None else x for x, option in zip(ctx.saved_tensors, ctx.options, strict=True))
+    if torch.is_grad_enabled():  # it is differentiated in turn
+        (found,) = differentiable_gradients(lambda own: by_torch(own, *given), [x], gradient, [True])
+    else:
+        found = by_operator(x, *given, gradient)
+    return found, *[None] * (len(given) + 1)
 
 
-def _in_order(x: Tensor, out: Tensor) -> Tensor:
-    """Return numbers that lie in memory as those of a dense tensor do."""
-    x = x.resolve_neg()
-    return x if x.stride() == out.stride() else torch.empty_like(out).copy_(x)
+@operator(lambda *given: _backward(*given, _srgb, _convert_by_torch), _keep)
+def _srgb(image: Tensor, encode: bool, gradient: Tensor | None = None) -> Iterator[Tensor]:
+    return _fill("convert", image, gradient, (), encode)
 
 
-def _call_srgb(out: Tensor, image: Tensor, gradient: Tensor | None, encode: bool) -> Tensor:
-    return _call(load(SOURCE, out.dtype).convert, out, (image, gradient), encode)
+@operator(lambda *given: _backward(*given, _record, _record_by_torch), _keep)
+def _record(
+    light: Tensor,
+    shot: Tensor | None,
+    read: Tensor | None,
+    offset: Tensor | None,
+    full_well: float,
+    dark: float,
+    sigma: float,
+    bits: int,
+    clip: bool,
+    gradient: Tensor | None = None,
+) -> Iterator[Tensor]:
+    return _fill("record", light, gradient, (shot, read, offset), full_well, dark, sigma, 2**bits - 1, clip)
 
 
-def _call_record(out: Tensor, light: Tensor, gradient: Tensor | None, *given: Any) -> Tensor:
-    *fields, full_well, dark, sigma, bits, clip = given
-    numbers = full_well, dark, sigma, 2**bits - 1, clip
-    return _call(load(SOURCE, out.dtype).record, out, (light, gradient, *fields), *numbers)
-
-
-_GIVEN = "Tensor? shot, Tensor? read, Tensor? offset, float full_well, float dark, float sigma, int bits, bool clip"
-_define("srgb", "Tensor image, bool encode", 1, _call_srgb, _convert_by_torch)
-_define("record", f"Tensor light, {_GIVEN}", 4, _call_record, _record_by_torch)
+def _fill(
+    function: str, x: Tensor, gradient: Tensor | None, fields: Sequence[Tensor | None], *numbers: float
+) -> Iterator[Tensor]:
+    """Yield memory like that of ``x``, and fill it by a function of pixels.c; with a gradient, by its product."""
+    given = x, gradient, *fields
+    if x.dtype not in REALS:
+        raise TypeError(f"values must be float32 or float64, got {x.dtype}")
+    for field in given:
+        if field is not None and (field.dtype, field.shape) != (x.dtype, x.shape):
+            raise ValueError(
+                f"fields must be {x.dtype} of shape {tuple(x.shape)} as the values, got {field.dtype} of shape "
+                f"{tuple(field.shape)}"
+            )
+    out = torch.empty_like(x)
+    yield out
+    # In the order of the result's memory, which may be any.
+    ordered = (x if x is None or x.stride() == out.stride() else torch.empty_like(out).copy_(x) for x in given)
+    call(getattr(load(SOURCE, x.dtype), function), *((x,) for x in (*ordered, out)), out.numel(), *numbers)

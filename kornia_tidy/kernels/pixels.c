@@ -176,13 +176,24 @@ INLINE const REAL *padded(const REAL *field, int64_t count, REAL *own) {
     return own;
 }
 
-// Records `count` numbers; with a gradient, multiplies it by the derivative instead. All fields but `x` may be null.
-void record(const REAL *x, const REAL *gradient, const REAL *shot, const REAL *read, const REAL *offset, REAL *out,
-            int64_t count, double full_well, double dark, double sigma, int64_t top, int64_t clip, int64_t threads) {
-    const sensor s = {full_well, dark, sigma, top, clip};
-#pragma omp parallel for num_threads(threads) if (count > 8 * BLOCK)
-    for (int64_t first = 0; first < count; first += BLOCK) {
-        const int64_t end = first + least(BLOCK, count - first);
+// The fields of `_record` in pixel_ops.py.
+typedef struct {
+    int64_t threads;
+    const REAL *x, *gradient, *shot, *read, *offset;  // all but `x` may be null
+    REAL *out;
+    int64_t count;
+    double full_well, dark, sigma;
+    int64_t top, clip;
+} recording;
+
+// Records `count` numbers; with a gradient, multiplies it by the derivative instead.
+int record(const recording *r) {
+    const sensor s = {r->full_well, r->dark, r->sigma, r->top, r->clip};
+    const REAL *x = r->x, *gradient = r->gradient, *shot = r->shot, *read = r->read, *offset = r->offset;
+    REAL *out = r->out;
+#pragma omp parallel for num_threads(r->threads) if (r->count > 8 * BLOCK)
+    for (int64_t first = 0; first < r->count; first += BLOCK) {
+        const int64_t end = first + least(BLOCK, r->count - first);
         int64_t n = first;
         for (; n + LANES <= end; n += LANES) {
             vec made = recorded(*(const loose *)(x + n), at(shot, n), at(read, n), at(offset, n), &s, gradient != 0);
@@ -195,6 +206,7 @@ void record(const REAL *x, const REAL *gradient, const REAL *shot, const REAL *r
                         padded(at(offset, n), end - n, own[3]), &s, gradient != 0);
         for (int64_t i = 0; n + i < end; i++) out[n + i] = gradient ? last[i] * gradient[n + i] : last[i];
     }
+    return 0;
 }
 
 // log2(1.5 + x) and exp2(x) for |x| <= 1/2, through Chebyshev's points.
@@ -258,14 +270,23 @@ INLINE void convert_block(const REAL *x, const REAL *gradient, REAL *out, int64_
     for (int64_t i = 0; n + i < count; i++) out[n + i] = gradient ? last[i] * gradient[n + i] : last[i];
 }
 
-// Decodes or encodes `count` numbers; with a gradient, which may be null, multiplies it by the derivative instead.
-void convert(const REAL *x, const REAL *gradient, REAL *out, int64_t count, int64_t encoding, int64_t threads) {
-#pragma omp parallel for num_threads(threads) if (count > 8 * BLOCK)
-    for (int64_t n = 0; n < count; n += BLOCK) {
-        const int64_t size = least(BLOCK, count - n);
-        if (gradient && encoding) convert_block(x + n, gradient + n, out + n, size, 1);
-        else if (gradient) convert_block(x + n, gradient + n, out + n, size, 0);
-        else if (encoding) convert_block(x + n, 0, out + n, size, 1);
-        else convert_block(x + n, 0, out + n, size, 0);
+// The fields of `_srgb` in pixel_ops.py.
+typedef struct {
+    int64_t threads;
+    const REAL *x, *gradient;  // the second may be null
+    REAL *out;
+    int64_t count, encoding;
+} conversion;
+
+// Decodes or encodes `count` numbers; with a gradient, multiplies it by the derivative instead.
+int convert(const conversion *c) {
+#pragma omp parallel for num_threads(c->threads) if (c->count > 8 * BLOCK)
+    for (int64_t n = 0; n < c->count; n += BLOCK) {
+        const int64_t size = least(BLOCK, c->count - n);
+        if (c->gradient && c->encoding) convert_block(c->x + n, c->gradient + n, c->out + n, size, 1);
+        else if (c->gradient) convert_block(c->x + n, c->gradient + n, c->out + n, size, 0);
+        else if (c->encoding) convert_block(c->x + n, 0, c->out + n, size, 1);
+        else convert_block(c->x + n, 0, c->out + n, size, 0);
     }
+    return 0;
 }

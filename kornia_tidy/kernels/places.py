@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-PLACES = (
-    *((name, ctypes.c_int64) for name in ("node_rows", "node_columns", "down", "across")),
-    *((name, ctypes.c_void_p) for name in ("row_edges", "column_edges", "row_middles", "column_middles")),
-    *((name, ctypes.c_void_p) for name in ("row_weights", "column_weights")),
-)  # the struct
+from kornia_tidy.kernels.operators import check
 
 
 class Places(NamedTuple):
@@ -55,58 +51,50 @@ class Places(NamedTuple):
         return ((a + y)[:, None, :, None] * b[:, None] + a[:, None, :, None] * x[:, None]).flatten(0, 1)
 
 
-def check_places(places: list[Tensor], nodes: tuple[int, ...]) -> None:
-    """Refuse places with tensors that do not fit one another or the nodes. Looks at no value."""
-    given = Places(*places)
-    for axis, many in zip((given[:3], given[3:]), nodes, strict=True):
-        edges, middles, weights = axis
-        tiles = tuple(middles.shape)
-        if (tuple(edges.shape), tuple(weights.shape)) != ((len(middles) + 1,), (*tiles, 2, many)):
-            shapes = ", ".join(str(tuple(x.shape)) for x in axis)
-            raise ValueError(
-                f"places must be n + 1 edges, n middles and (n, 2, {many}) weights of nodes, got shapes {shapes}"
-            )
-
-
-def of_axis(psfs: Tensor, places: list[Tensor]) -> Tensor:
+def of_axis(psfs: Tensor, places: Sequence[Tensor] | None) -> Tensor:
     """Return the PSFs of a node where there are places, and refuse wrong places."""
     if not places:
         return psfs
-    if psfs.ndim != 6 or 0 in psfs.shape[:2]:
-        raise ValueError(f"psfs over the field must have shape (I, J, D, C, P, P), got {tuple(psfs.shape)}")
+    check({}, None, **{"psfs over the field": (psfs, "I J D C P P")})
+    if 0 in psfs.shape[:2]:
+        raise ValueError(f"psfs over the field must have nodes, got shape {tuple(psfs.shape)}")
     check_places(places, psfs.shape[:2])
     return psfs[0, 0]
 
 
-def parameters_of(
-    places: list[Tensor], size: tuple[int, int], most: tuple[int, int], dtype: torch.dtype
-) -> tuple[dict[str, int], dict[str, Tensor]]:
-    """Return the numbers and the tensors of the struct, edges in int64 and the rest in the data type of the PSFs.
+def check_places(places: Sequence[Tensor], nodes: Sequence[int]) -> None:
+    """Refuse places with tensors that do not fit one another or the nodes. Looks at no value."""
+    given = Places(*places)
+    for axis, many in zip((given[:3], given[3:]), nodes, strict=True):
+        edges, middles, weights = axis
+        sizes = {"nodes": many, "edges": len(middles) + 1}
+        check(sizes, torch.int64, **{"edges of tiles": (edges, "edges")})
+        check(sizes, None, middles=(middles, "tiles"), weights=(weights, "tiles 2 nodes"))
+
+
+def fields_of(
+    places: Sequence[Tensor] | None, size: tuple[int, int], most: tuple[int, int], dtype: torch.dtype
+) -> tuple[Any, ...]:
+    """Return the fields of the struct: zeros, or edges in int64 and the rest in the data type of the PSFs.
 
     Args:
-        places: :class:`Places`, checked.
+        places: :class:`Places`, checked, or none.
         size: rows and columns that the tiles must cover.
         most: rows and columns of a tile.
         dtype: of the PSFs.
 
     Raises:
-        TypeError: if edges are not int64.
         ValueError: if tiles do not cover the pixels or are too large.
     """
+    if not places:
+        return (0,) * 10
     given = Places(*places)
-    for edges, pixels, largest in zip((given.row_edges, given.column_edges), size, most, strict=True):
-        _check_edges(edges, pixels, largest)
-    numbers = {"node_rows": given.row_weights.shape[-1], "node_columns": given.column_weights.shape[-1]}
-    numbers |= {"down": len(given.row_middles), "across": len(given.column_middles)}
-    return numbers, {name: x if name.endswith("edges") else x.to(dtype) for name, x in given._asdict().items()}
-
-
-def _check_edges(edges: Tensor, pixels: int, largest: int) -> None:
-    """Refuse tiles that do not cover the pixels of an axis or do not fit into windows."""
-    if edges.dtype != torch.int64:
-        raise TypeError(f"edges of tiles must be int64, got {edges.dtype}")
-    tiles = edges.diff()
-    if edges[0] != 0 or edges[-1] != pixels or tiles.min() < 1 or tiles.max() > largest:
-        raise ValueError(
-            f"edges of tiles must ascend from 0 to {pixels} by {largest} at most, got {edges.tolist()!s:.80}"
-        )
+    down, across = given[:3], given[3:]
+    for (edges, *_), pixels, largest in zip((down, across), size, most, strict=True):
+        tiles = edges.diff()
+        if edges[0] != 0 or edges[-1] != pixels or tiles.min() < 1 or tiles.max() > largest:
+            raise ValueError(
+                f"edges of tiles must ascend from 0 to {pixels} by {largest} at most, got {edges.tolist()!s:.80}"
+            )
+    sizes = down[2].shape[2], across[2].shape[2], len(down[1]), len(across[1])
+    return *sizes, down[0], across[0], *(part[n].to(dtype) for n in (1, 2) for part in (down, across))

@@ -18,17 +18,16 @@
 
 enum { BLOCK = 4, SPAN = REGISTERS == 32 ? 6 : 3 };  // rows and vectors of a product that stay in registers
 enum { ROWS = 4 };                                   // of a patch: weights of points are padded to a multiple
-enum { NO_MEMORY = 1, OUTSIDE = 2 };                 // status of the functions
 
-// The fields of `_Scattered` in scattered_ops.py.
+// The fields of `_fill` in scattered_ops.py.
 typedef struct {
-    int64_t places, depths, exposures, states, cells, patches, points, phases, amplitudes, width, degree, extent, quarter,
-        samples, shifts, window, threads;
+    int64_t threads, places, depths, exposures, states, cells, patches, points, phases, amplitudes, width, degree, extent, quarter,
+        samples, shifts, window;
+    const REAL *waves, *weights;                  // (exposures, states, cells) complex, (states,)
     const int64_t *cell;                          // (patches,)
     const double *values;                         // (places, 2 + phases + amplitudes, patches, points)
     const double *phase_terms, *amplitude_terms;  // (depths, phases), (depths, amplitudes)
     const REAL *kernel;                           // (degree + 1,)
-    const REAL *waves, *weights;                  // (exposures, states, cells) complex, (states,)
     const REAL *cosines, *sines;                  // (quarter, extent / 2 + 1)
     const REAL *rows, *columns;                   // (places, exposures, shifts, window, samples)
     const REAL *gradient;                         // (places, depths, exposures, shifts, window, window); not for light
@@ -651,7 +650,7 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     const scattered *s = w->s;
     const int64_t total = s->patches * s->points;
     const double *places = s->values + place * (2 + s->phases + s->amplitudes) * total;
-    if (!find_patches(w, places)) return OUTSIDE;
+    if (!find_patches(w, places)) return REFUSED;
     w->rows = padded(w->tall, ROWS), w->vecs = (2 * w->tall + LANES - 1) / LANES;
     const int64_t most = 2 * (s->extent - w->tall) + w->vecs * LANES;
     w->across = ((most > 2 * s->extent ? most : 2 * s->extent) + LANES - 1) / LANES;
@@ -688,7 +687,7 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     return status;
 }
 
-// The light, or with a gradient of it those of waves and weights. Returns 0, NO_MEMORY, or OUTSIDE where points lie beyond
+// The light, or with a gradient of it those of waves and weights. Returns 0, NO_MEMORY, or REFUSED where points lie beyond
 // the grid.
 int scattered_light(const scattered *s) {
     const int64_t most = s->extent / 4 + 1, quarter = s->quarter;  // even or odd rows

@@ -11,17 +11,16 @@ come from the same in torch.
 
 from __future__ import annotations
 
-import ctypes
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from kornia_tidy.kernels.build import KERNELS, load
-from kornia_tidy.kernels.operators import Parameters, define
+from kornia_tidy.kernels.operators import call, check, differentiable_gradients, operator
 
 SOURCE = KERNELS / "scattered.c"
-_NO_MEMORY, _OUTSIDE = 1, 2  # status of the functions
 
 
 class Points(NamedTuple):
@@ -50,49 +49,22 @@ class Transform(NamedTuple):
     sample that lies k + 1/2 from the middle is that at k + 1/2 - L.
 
     Args:
-        width: of the kernel in samples of the grid.
         kernel: its value as a polynomial in :math:`1 - t^2`, with t from -1 to 1 over its width, (n,).
         cosines: real part of T for sums of rows of the grid that lie mirrored about its middle, (L / 2, (M + 1) / 2),
             for samples of the first quarter of a period.
         sines: imaginary part of T for their differences, negative.
     """
 
-    width: int
     kernel: Tensor
     cosines: Tensor
     sines: Tensor
 
 
-def scattered_light(
-    waves: Tensor, weights: Tensor, points: Points, transform: Transform, rows: Tensor, columns: Tensor
-) -> Tensor:
-    r"""Return the light in the pixels of a sensor: operator ``kornia_tidy::scattered_light``.
-
-    Args:
-        waves: u, (E, K, N) complex64 or complex128 on a processor.
-        weights: w, (K,), of the waves' real dtype.
-        points: a, y and x of the points.
-        transform: kernel and T.
-        rows: R, (F, E, V, P, Q).
-        columns: C, (F, E, V, P, Q).
-
-    Returns:
-        (F, D, E, V, P, P). It has gradients with respect to waves and weights, which can be differentiated in turn.
-
-    Raises:
-        TypeError: if a data type is not as above.
-        ValueError: if shapes do not fit, or points touch samples beyond the grid.
-        MemoryError: if memory for the grids is missing.
-        NotBuiltError: if the source cannot be compiled.
-    """
-    return torch.ops.kornia_tidy.scattered_light(waves, weights, *points, *transform, rows, columns)
-
-
 def scattered_light_by_torch(
-    waves: Tensor, weights: Tensor, points: Points, transform: Transform, rows: Tensor, columns: Tensor
+    waves: Tensor, weights: Tensor, points: Points, width: int, transform: Transform, rows: Tensor, columns: Tensor
 ) -> Tensor:
     """Return the same by plain operations, on any device, see :func:`scattered_light`."""
-    width, kernel, cosines, sines = transform
+    kernel, cosines, sines = transform
     extent, found = 2 * cosines.shape[1] - 1, []
     whole = whole_transform(cosines, sines, rows.shape[-1])
     own, phases = waves[..., points.cell], points.phase_terms.shape[1]
@@ -146,165 +118,114 @@ def whole_transform(cosines: Tensor, sines: Tensor, samples: int) -> Tensor:
     return torch.cat([upper.flip(0).conj(), upper])
 
 
-class _Scattered(Parameters):
-    """The struct ``scattered`` in scattered.c."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("places", "depths", "exposures", "states", "cells", "patches", "points")),
-        *((name, ctypes.c_int64) for name in ("phases", "amplitudes", "width", "degree", "extent", "quarter")),
-        *((name, ctypes.c_int64) for name in ("samples", "shifts", "window", "threads")),
-        *((name, ctypes.c_void_p) for name in ("cell", "values", "phase_terms", "amplitude_terms", "kernel", "waves")),
-        *((name, ctypes.c_void_p) for name in ("weights", "cosines", "sines", "rows", "columns", "gradient", "light")),
-        *((name, ctypes.c_void_p) for name in ("of_waves", "of_weights")),
-    )
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    waves, weights, points, ctx.width, transform, *sums = inputs
+    ctx.save_for_backward(waves, weights, *points, *transform, *sums)
 
 
-def _new_light(
+def _backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+    waves, weights, *given = ctx.saved_tensors
+    rest: Any = Points(*given[:4]), ctx.width, Transform(*given[4:7]), *given[7:]
+    if not torch.is_grad_enabled():
+        found = scattered_light_gradients(waves, weights, *rest, gradient)
+    else:  # the gradients are differentiated in turn
+        light = lambda *own: scattered_light_by_torch(*own, *rest)  # noqa: E731
+        found = differentiable_gradients(light, (waves, weights), gradient, ctx.needs_input_grad[:2])
+    return *found, [None] * 4, None, [None] * 3, None, None
+
+
+@operator(_backward, _keep)
+def scattered_light(
     waves: Tensor,
     weights: Tensor,
-    cell: Tensor,
-    values: Tensor,
-    phase_terms: Tensor,
-    amplitude_terms: Tensor,
+    points: Sequence[Tensor],
     width: int,
-    kernel: Tensor,
-    cosines: Tensor,
-    sines: Tensor,
+    transform: Sequence[Tensor],
     rows: Tensor,
     columns: Tensor,
-) -> Tensor:
-    """Check the arguments and return the memory of the result, which is also the fake implementation."""
+) -> Iterator[Tensor]:
+    r"""Return the light in the pixels of a sensor: operator ``kornia_tidy::scattered_light``.
+
+    Args:
+        waves: u, (E, K, N) complex64 or complex128 on a processor.
+        weights: w, (K,), of the waves' real dtype.
+        points: a, y and x of :class:`Points`.
+        width: of the kernel in samples of the grid.
+        transform: kernel and T of :class:`Transform`.
+        rows: R, (F, E, V, P, Q).
+        columns: C, (F, E, V, P, Q).
+
+    Returns:
+        (F, D, E, V, P, P). It has gradients with respect to waves and weights, which can be differentiated in turn.
+
+    Raises:
+        TypeError: if a data type is not as above.
+        ValueError: if shapes do not fit, or points touch samples beyond the grid.
+        MemoryError: if memory for the grids is missing.
+        NotBuiltError: if the source cannot be compiled.
+    """
+    given = waves, weights, points, width, transform, rows, columns
+    light, numbers = _new_light(*given)
+    yield light
+    _fill(light, numbers, given, light=light)
+
+
+@operator()
+def scattered_light_gradients(
+    waves: Tensor,
+    weights: Tensor,
+    points: Sequence[Tensor],
+    width: int,
+    transform: Sequence[Tensor],
+    rows: Tensor,
+    columns: Tensor,
+    gradient: Tensor,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Return gradients of waves, (E, K, N), and weights, (K,), summed in the same order every time."""
+    found = torch.empty_like(waves, memory_format=torch.contiguous_format), torch.empty_like(weights)
+    yield found
+    given = waves, weights, points, width, transform, rows, columns
+    light, numbers = _new_light(*given)
+    if gradient.shape != light.shape:
+        raise ValueError(f"gradient must have the shape of the light, got {tuple(gradient.shape)}")
+    _fill(light, numbers, given, gradient=gradient, of_waves=found[0].zero_(), of_weights=found[1].zero_())
+
+
+def _new_light(*given: Any) -> tuple[Tensor, tuple[int, ...]]:
+    """Check the arguments and return the memory of the result, and the first numbers of the struct in scattered.c."""
+    waves, weights, points, width, transform, rows, columns = given
+    (cell, values, phase_terms, amplitude_terms), (kernel, cosines, sines) = points, transform
     if waves.dtype not in (torch.complex64, torch.complex128):
         raise TypeError(f"waves must be complex64 or complex128, got {waves.dtype}")
-    real = waves.dtype.to_real()
-    tables = {
-        "weights": weights,
-        "kernel": kernel,
-        "cosines": cosines,
-        "sines": sines,
-        "rows": rows,
-        "columns": columns,
-    }
-    for name, part in tables.items():
-        if part.dtype != real:
-            raise TypeError(f"{name} must be of the waves' real dtype {real}, got {part.dtype}")
-    terms = {"cell": cell, "values": values, "phase_terms": phase_terms, "amplitude_terms": amplitude_terms}
-    for name, part in terms.items():
-        if part.dtype != (kind := torch.int64 if part is cell else torch.float64):
-            raise TypeError(f"{name} must be {str(kind).removeprefix('torch.')}, got {part.dtype}")
-    if waves.ndim != 3 or tuple(weights.shape) != tuple(waves.shape[1:2]):
-        shapes = tuple(waves.shape), tuple(weights.shape)
-        raise ValueError(f"waves and weights must have shapes (E, K, N) and (K,), got {shapes[0]} and {shapes[1]}")
-    depths, phases = phase_terms.shape
-    expected = len(rows), 2 + phases + amplitude_terms.shape[1], *cell.shape
-    if values.ndim != 4 or tuple(values.shape[:3]) != expected or len(amplitude_terms) != depths:
-        raise ValueError(f"values must have shape {(*expected, 'S')} for the terms, got {tuple(values.shape)}")
-    if kernel.ndim != 1 or not len(kernel) or width < 1:
-        raise ValueError(
-            f"kernel must have shape (n,) and a width of at least 1, got {tuple(kernel.shape)} and a width of {width}"
-        )
-    if cosines.ndim != 2 or cosines.shape != sines.shape:
-        raise ValueError(f"cosines and sines must have one shape, got {tuple(cosines.shape)} and {tuple(sines.shape)}")
-    most = 4 * len(cosines)
-    if rows.ndim != 5 or rows.shape != columns.shape or rows.shape[1] != len(waves):
-        raise ValueError(
-            f"rows and columns must have shape (F, {len(waves)}, V, P, Q), got {tuple(rows.shape)} and "
-            f"{tuple(columns.shape)}"
-        )
-    if rows.shape[4] % 2 or rows.shape[4] > most:
-        raise ValueError(f"rows and columns must have an even number of at most {most} samples, got {rows.shape[4]}")
-    return weights.new_empty(len(rows), depths, *rows.shape[1:4], rows.shape[3])
+    sizes: dict[str, int] = {}
+    check(sizes, None, waves=(waves, "E K N"))
+    tables = {"cosines": (cosines, "L/2 (M+1)/2"), "sines": (sines, "L/2 (M+1)/2")}
+    sums = {"rows": (rows, "F E V P Q"), "columns": (columns, "F E V P Q")}
+    check(sizes, waves.dtype.to_real(), weights=(weights, "K"), kernel=(kernel, "n"), **tables, **sums)
+    check(sizes, torch.int64, cell=(cell, "C"))
+    check(sizes, torch.float64, phase_terms=(phase_terms, "D R"), amplitude_terms=(amplitude_terms, "D A"))
+    sizes["2+R+A"] = 2 + sizes["R"] + sizes["A"]
+    check(sizes, torch.float64, values=(values, "F 2+R+A C S"))
+    if not len(kernel) or width < 1:
+        raise ValueError(f"kernel and its width must be at least 1, got {len(kernel)} coefficients and width {width}")
+    samples, most = rows.shape[4], 4 * len(cosines)
+    if samples % 2 or samples > most:
+        raise ValueError(f"rows and columns must have an even number of at most {most} samples, got {samples}")
+    extent = 2 * cosines.shape[1] - 1
+    numbers = *(sizes[name] for name in "FDEKNCSRA"), width, len(kernel) - 1, extent, len(cosines), samples
+    return weights.new_empty([sizes[name] for name in "FDEVPP"]), (*numbers, *rows.shape[2:4])
 
 
-def _light(*given: Any) -> Tensor:
-    light = _new_light(*given)
-    _call(light, *given)
-    return light
-
-
-def _new_gradients(waves: Tensor, weights: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
-    return torch.empty_like(waves, memory_format=torch.contiguous_format), torch.empty_like(weights)
-
-
-def _gradients(waves: Tensor, weights: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
-    """Return (E, K, N) and (K,), summed in the same order every time."""
-    *points, gradient = given
-    found = _new_gradients(waves, weights)
-    if gradient.shape != _new_light(waves, weights, *points).shape:
-        raise ValueError(f"gradient must have the shape of the light, got {tuple(gradient.shape)}")
-    _call(gradient, waves, weights, *points, of_waves=found[0].zero_(), of_weights=found[1].zero_())
-    return found
-
-
-def _call(light: Tensor, *given: Any, **gradients: Tensor) -> None:
+def _fill(out: Tensor, numbers: tuple[int, ...], given: tuple[Any, ...], **of: Tensor) -> None:
     """Call the function of scattered.c, which fills the light, or reads its gradient and fills those of the rest."""
-    waves, weights, cell, values, phase_terms, amplitude_terms, width, kernel, cosines, sines, rows, columns = given
-    if not values.numel() or not light.numel() or not waves.numel():
-        for out in gradients.values() or (light,):
-            out.zero_()
+    waves, weights, points, _, transform, *sums = given
+    if not points[1].numel() or not out.numel() or not waves.numel():
+        out.zero_()
         return
-    if int(cell.min()) < 0 or int(cell.max()) >= waves.shape[2]:
-        raise IndexError(f"cell must lie from 0 to {waves.shape[2] - 1}, got {int(cell.min())} to {int(cell.max())}")
-    scattered = _Scattered(
-        places=len(rows),
-        depths=len(phase_terms),
-        exposures=len(waves),
-        states=waves.shape[1],
-        cells=waves.shape[2],
-        patches=len(cell),
-        points=values.shape[3],
-        phases=phase_terms.shape[1],
-        amplitudes=amplitude_terms.shape[1],
-        width=width,
-        degree=len(kernel) - 1,
-        extent=2 * cosines.shape[1] - 1,
-        quarter=len(cosines),
-        samples=rows.shape[4],
-        shifts=rows.shape[2],
-        window=rows.shape[3],
-    )
-    scattered.point_to(
-        cell=cell,
-        values=values,
-        phase_terms=phase_terms,
-        amplitude_terms=amplitude_terms,
-        kernel=kernel,
-        waves=waves.resolve_conj(),
-        weights=weights.resolve_neg(),
-        cosines=cosines,
-        sines=sines,
-        rows=rows,
-        columns=columns,
-        **({"gradient": light.resolve_neg()} if gradients else {"light": light}),
-        **gradients,
-    )
-    status = load(SOURCE, weights.dtype).scattered_light(ctypes.byref(scattered))
-    if status == _OUTSIDE:
-        raise ValueError(f"points must lie in the grid of {2 * cosines.shape[1] - 1} samples")
-    if status == _NO_MEMORY:
-        raise MemoryError(f"no memory for PSFs of {rows.shape[2]}x{rows.shape[2]} pixels")
-
-
-def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    ctx.save_for_backward(*(x for x in inputs if isinstance(x, Tensor)))
-    ctx.width = inputs[6]
-
-
-def _backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-    waves, weights, *given = ctx.saved_tensors
-    given.insert(4, ctx.width)
-    rest = (None,) * len(given)
-    if not torch.is_grad_enabled():
-        return *torch.ops.kornia_tidy.scattered_light_gradients(waves, weights, *given, gradient), *rest
-    own = waves.view_as(waves), weights.view_as(weights)  # the gradients are differentiated in turn
-    light = scattered_light_by_torch(*own, Points(*given[:4]), Transform(*given[4:8]), *given[8:])
-    found = iter(torch.autograd.grad(light, [x for x in own if x.requires_grad], gradient, create_graph=True))
-    return *(next(found) if x.requires_grad else None for x in own), *rest
-
-
-_GIVEN = (
-    "Tensor waves, Tensor weights, Tensor cell, Tensor values, Tensor phase_terms, Tensor amplitude_terms, int width, "
-    "Tensor kernel, Tensor cosines, Tensor sines, Tensor rows, Tensor columns"
-)
-define("scattered_light", f"({_GIVEN}) -> Tensor", _light, _new_light, _backward, _keep)
-define("scattered_light_gradients", f"({_GIVEN}, Tensor gradient) -> (Tensor, Tensor)", _gradients, _new_gradients)
+    first, last = int(points[0].min()), int(points[0].max())
+    if first < 0 or last >= waves.shape[2]:
+        raise IndexError(f"cell must lie from 0 to {waves.shape[2] - 1}, got {first} to {last}")
+    results = (of.get(name) for name in ("gradient", "light", "of_waves", "of_weights"))
+    library = load(SOURCE, weights.dtype)
+    if call(library.scattered_light, *numbers, waves, weights, *points, *transform, *sums, *results):
+        raise ValueError(f"points must lie in the grid of {2 * transform[1].shape[1] - 1} samples")

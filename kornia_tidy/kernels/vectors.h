@@ -32,6 +32,8 @@ typedef vec loose __attribute__((aligned(1), may_alias));
 // For callers that want to know.
 const int64_t vector_bytes = VECTOR_BYTES;
 
+enum { NO_MEMORY = 1, REFUSED = 2 };  // status of functions: REFUSED is of values that they cannot use
+
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 
 INLINE vec all(REAL x) { return x - (vec){0}; }

@@ -133,8 +133,8 @@ def scattered_energies(
         rows: sums over samples for the pixels along y, (F, E, V, P, N).
         columns: the same along x.
     """
-    transform = Transform(grid.width, *(part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines)))
-    given = waves, weights, points, transform, rows.to(weights), columns.to(weights)
+    transform = Transform(*(part.to(weights) for part in (grid.kernel, grid.cosines, grid.sines)))
+    given = waves, weights, points, grid.width, transform, rows.to(weights), columns.to(weights)
     here = waves.device.type == "cpu" and not torch_mode() & Mode.TRACED
     if here and compiled(SOURCE, weights.dtype) is not None:
         return scattered_light(*given)

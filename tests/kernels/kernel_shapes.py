@@ -115,7 +115,7 @@ def gather(draw: random.Random) -> Call:
             allowed = allowed + gamma(terms, scene.light.dtype) * reach
         return expected, allowed
 
-    arguments = scene.light, scene.psfs, scene.lower, scene.fraction, weight_gradient
+    arguments = scene.light, scene.psfs, scene.lower, scene.fraction, False, weight_gradient
     about = f"{scene.about} weight_gradient {weight_gradient}"
     return Call(about, "gather_direct", arguments, scene.products, truth)
 
@@ -413,7 +413,12 @@ def field_gradient(draw: random.Random) -> Call:
 def scattered(draw: random.Random) -> Call:
     """``scattered_light`` of scattered.c: the light."""
     case, about, products = _scattered(draw)
-    return Call(about, "scattered_light", case, products, lambda: scattered_written_out(*case))
+    return Call(about, "scattered_light", scattered_arguments(case), products, lambda: scattered_written_out(*case))
+
+
+def scattered_arguments(case: tuple[Any, ...]) -> tuple[Any, ...]:
+    """The operator's arguments from those of ``scattered_written_out``."""
+    return *case[:2], list(case[2:6]), case[6], list(case[7:10]), *case[10:]
 
 
 def scattered_gradient(draw: random.Random) -> Call:
@@ -430,7 +435,7 @@ def scattered_gradient(draw: random.Random) -> Call:
         (bound,) = torch.autograd.grad((allowed * light.double().abs()).sum(), large)
         return torch.view_as_real(expected), 2 * bound.real[..., None]
 
-    return Call(about, "scattered_light_gradients", (*case, light), 2 * products, truth)
+    return Call(about, "scattered_light_gradients", (*scattered_arguments(case), light), 2 * products, truth)
 
 
 def scattered_written_out(
@@ -512,7 +517,7 @@ def srgb_gradient(draw: random.Random) -> Call:
         (expected,) = torch.autograd.grad(srgb_by_definition(exact, encode), exact, gradient.double())
         return expected, gamma(16, image.dtype) * expected.abs() + torch.finfo(image.dtype).tiny
 
-    return Call(about, "srgb_gradient", (image, gradient, encode), image.numel(), truth)
+    return Call(about, "srgb", (image, encode, gradient), image.numel(), truth)
 
 
 def srgb_by_definition(image: Tensor, encode: bool) -> Tensor:
@@ -584,7 +589,7 @@ def sensor_gradient(draw: random.Random) -> Call:
         off = gamma(32, light.dtype) * (1 + recorded.slope.abs()) * gradient.double().abs()
         return expected, torch.where(recorded.torn, torch.inf, off)
 
-    return Call(about, "record_gradient", (light, gradient, *rest), light.numel(), truth)
+    return Call(about, "record", (light, *rest, gradient), light.numel(), truth)
 
 
 def _sensed(draw: random.Random) -> tuple[tuple[Any, ...], str]:

@@ -80,7 +80,7 @@ class TestGatherDirect(LayeredSceneTester):
     @pytest.mark.parametrize(
         ("changes", "error", "words"),
         [
-            ({"layer_index": torch.zeros(2, 5, 16)}, TypeError, "layer_index must be int64, got torch.float32"),
+            ({"layer_index": torch.zeros(2, 5, 16)}, TypeError, "layer_index must be torch.int64, got torch.float32"),
             (
                 {
                     "plane": torch.zeros(2, 2, 5, 16).double(),

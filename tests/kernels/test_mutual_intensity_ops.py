@@ -38,10 +38,10 @@ class TestMutualIntensityEnergies(OperatorTester):
         ("changed", "error", "words"),
         [
             (lambda u, w, k: (u.real, w, k), TypeError, "field must be complex64 or complex128, got torch.float64"),
-            (lambda u, w, k: (u, w.float(), k), TypeError, "weights must be of the .* dtype .*float64, got .*32"),
-            (lambda u, w, k: (u, w, k.to(torch.complex64)), TypeError, "kernels must be of the field's dtype"),
+            (lambda u, w, k: (u, w.float(), k), TypeError, "weights must be .*float64, got .*32"),
+            (lambda u, w, k: (u, w, k.to(torch.complex64)), TypeError, "kernels must be .*complex128, got .*64"),
             (lambda u, w, k: (u[0], w, k), ValueError, r"field must have shape \(K, N, N\), got \(7, 7\)"),
-            (lambda u, w, k: (u, w[:2], k), ValueError, r"weights must have shape \(3,\), got \(2,\)"),
+            (lambda u, w, k: (u, w[:2], k), ValueError, r"weights must have shape \(3\), got \(2,\)"),
             (lambda u, w, k: (u, w, k[..., :5]), ValueError, r"kernels must have shape .* got \(4, 5, 2, 5\)"),
         ],
     )

@@ -115,7 +115,7 @@ class TestGatherOverlap(LayeredSceneTester):
     @pytest.mark.parametrize(
         ("changes", "error", "words"),
         [
-            ({"layer_index": torch.zeros(2, 4, 17)}, TypeError, "layer_index must be int64, got torch.float32"),
+            ({"layer_index": torch.zeros(2, 4, 17)}, TypeError, "layer_index must be torch.int64, got torch.float32"),
             ({"layer_weight": None, "weight_gradient": True}, ValueError, "weight_gradient needs a layer_weight"),
             ({"size": 24}, ValueError, "size must be at least the PSFs' side 3, a multiple of 16 and .*, got 24"),
             ({"size": 112}, ValueError, "without prime factors but 2, 3 and 5, got 112"),
@@ -177,7 +177,7 @@ class TestGatherOverField(SceneOperatorTester):
             ({"column_edges": [0, 17, 17]}, "edges of tiles must ascend from 0 to 17 by 14 at most"),
             (
                 {"column_edges": [0, 17]},
-                r"places must be n \+ 1 edges, n middles and \(n, 2, 3\) weights of nod",
+                r"edges of tiles must have shape \(3\), got \(2,\)",
             ),
         ],
     )
@@ -190,7 +190,7 @@ class TestGatherOverField(SceneOperatorTester):
     def test_exception_edges_of_another_dtype(self):
         given = over_field()
         places = given["places"]
-        with pytest.raises(TypeError, match=r"edges of tiles must be int64, got torch\.int32"):
+        with pytest.raises(TypeError, match=r"edges of tiles must be torch\.int64, got torch\.int32"):
             gather_overlap(**{**given, "places": places._replace(row_edges=places.row_edges.int())})
 
     def test_exception_psfs_of_the_axis_with_places(self):

@@ -46,7 +46,7 @@ class TestRecord(OperatorTester):
         return torch.ops.kornia_tidy.record(torch.zeros(1), *[None] * 3, *NOTHING)
 
     def test_exception(self):
-        with pytest.raises(TypeError, match=r"light must be float32 or float64, got .*float16"):
+        with pytest.raises(TypeError, match=r"values must be float32 or float64, got .*float16"):
             torch.ops.kornia_tidy.record(torch.zeros(2).half(), *[None] * 3, *NOTHING)
 
     @needs_compiler
@@ -82,15 +82,18 @@ class TestRecordGradient(OperatorTester):
     source = SOURCE
 
     def smallest(self):
-        return torch.ops.kornia_tidy.record_gradient(
-            torch.zeros(1), torch.zeros(1), *[None] * 3, 1.0, 0.0, 0.0, 0, True
-        )
+        return torch.ops.kornia_tidy.record(torch.zeros(1), *[None] * 3, 1.0, 0.0, 0.0, 0, True, torch.zeros(1))
 
     def test_exception(self):
-        with pytest.raises(ValueError, match=r"fields must be .*32 of shape \(2,\) as the light, got .*64 of"):
-            torch.ops.kornia_tidy.record_gradient(
-                torch.zeros(2), torch.zeros(1).double(), *[None] * 3, 1, 0, 0, 0, True
-            )
+        with pytest.raises(ValueError, match=r"fields must be .*32 of shape \(2,\) as the values, got .*64 of"):
+            torch.ops.kornia_tidy.record(torch.zeros(2), *[None] * 3, 1, 0, 0, 0, True, torch.zeros(1).double())
+
+    @needs_compiler
+    def test_exception_a_gradient_has_no_gradient(self):
+        light = torch.zeros(2, requires_grad=True)
+        found = torch.ops.kornia_tidy.record(light, *[None] * 3, 1, 0, 0, 0, True, torch.zeros(2))
+        with pytest.raises(NotImplementedError, match="a gradient has no gradient here: differentiate functions of"):
+            found.sum().backward()
 
 
 @needs_compiler

@@ -19,7 +19,7 @@ def a_case(seed: int = 2, dtype: torch.dtype = torch.float64) -> tuple:
 
 
 def called(function, case):
-    return function(*case[:2], Points(*case[2:6]), Transform(*case[6:10]), *case[10:])
+    return function(*case[:2], Points(*case[2:6]), case[6], Transform(*case[7:10]), *case[10:])
 
 
 class TestScatteredLight(OperatorTester):
@@ -35,7 +35,9 @@ class TestScatteredLight(OperatorTester):
         torch.manual_seed(seed)
         call = kernel_shapes.scattered(random.Random(seed))
         expected, allowed = call.truth()
-        got = called(scattered_light_by_torch, call.arguments).double()
+        waves, weights, points, width, transform, *sums = call.arguments
+        given = waves, weights, Points(*points), width, Transform(*transform), *sums
+        got = scattered_light_by_torch(*given).double()
         assert bool(((got - expected).abs() <= allowed).all()), call.about
 
     @needs_compiler
@@ -86,16 +88,21 @@ class TestScatteredLight(OperatorTester):
         ("at", "change", "error", "words"),
         [
             (0, lambda x: x.real, TypeError, "waves must be complex64 or complex128, got torch.float64"),
-            (1, lambda x: x.float(), TypeError, "weights must be of the waves' real dtype .*float64, got .*32"),
-            (8, lambda x: x.float(), TypeError, "cosines must be of the waves' real dtype"),
-            (11, lambda x: x.float(), TypeError, "columns must be of the waves' real dtype"),
-            (3, lambda x: x.float(), TypeError, "values must be float64, got torch.float32"),
-            (2, lambda x: x.int(), TypeError, "cell must be int64, got torch.int32"),
-            (7, lambda x: x[:0], ValueError, r"kernel must have shape \(n,\) and a width of at least 1, got \(0,\)"),
-            (1, lambda x: x.repeat(2), ValueError, r"waves and weights must have shapes \(E, K, N\) and \(K,\), got"),
-            (3, lambda x: x[:, 1:], ValueError, "values must have shape .* for the terms, got"),
-            (9, lambda x: x[1:], ValueError, "cosines and sines must have one shape, got"),
-            (10, lambda x: x[..., 1:], ValueError, r"rows and columns must have shape \(F, \d+, V, P, Q\), got"),
+            (1, lambda x: x.float(), TypeError, "weights must be .*float64, got .*32"),
+            (8, lambda x: x.float(), TypeError, "cosines must be"),
+            (11, lambda x: x.float(), TypeError, "columns must be"),
+            (3, lambda x: x.float(), TypeError, "values must be torch.float64, got torch.float32"),
+            (2, lambda x: x.int(), TypeError, "cell must be torch.int64, got torch.int32"),
+            (
+                7,
+                lambda x: x[:0],
+                ValueError,
+                "kernel and its width must be at least 1, got 0 coefficients and width",
+            ),
+            (1, lambda x: x.repeat(2), ValueError, r"weights must have shape \(\d+\), got"),
+            (3, lambda x: x[:, 1:], ValueError, r"values must have shape \(\d+, \d+, \d+, S\), got"),
+            (9, lambda x: x[1:], ValueError, r"sines must have shape \(\d+, \d+\), got"),
+            (10, lambda x: x[..., 1:], ValueError, r"columns must have shape \(\d+, \d+, \d+, \d+, \d+\), got"),
         ],
     )
     def test_exception(self, at, change, error, words):
@@ -124,7 +131,7 @@ class TestScatteredLightGradients(OperatorTester):
     def smallest(self):
         case = a_case()
         light = torch.ones(len(case[10]), len(case[4]), *(case[10].shape[n] for n in (1, 2, 3, 3)), dtype=torch.float64)
-        return torch.ops.kornia_tidy.scattered_light_gradients(*case, light)
+        return torch.ops.kornia_tidy.scattered_light_gradients(*kernel_shapes.scattered_arguments(case), light)
 
     @needs_compiler
     def test_dynamo_is_one_node_of_a_whole_graph(self):

@@ -45,7 +45,7 @@ class TestSRGB(OperatorTester):
         assert torch.autograd.gradgradcheck(torch.ops.kornia_tidy.srgb, (x, encode))
 
     def test_exception(self):
-        with pytest.raises(TypeError, match=r"image must be float32 or float64, got .*float16"):
+        with pytest.raises(TypeError, match=r"values must be float32 or float64, got .*float16"):
             torch.ops.kornia_tidy.srgb(torch.zeros(2, dtype=torch.half), False)
 
 
@@ -54,11 +54,11 @@ class TestSRGBGradient(OperatorTester):
     source = SOURCE
 
     def smallest(self):
-        return torch.ops.kornia_tidy.srgb_gradient(torch.zeros(1), torch.zeros(1), False)
+        return torch.ops.kornia_tidy.srgb(torch.zeros(1), False, torch.zeros(1))
 
     def test_exception(self):
-        with pytest.raises(ValueError, match=r"fields must be .*32 of shape \(2,\) as the image, got .*64 of"):
-            torch.ops.kornia_tidy.srgb_gradient(torch.zeros(2), torch.zeros(1).double(), False)
+        with pytest.raises(ValueError, match=r"fields must be .*32 of shape \(2,\) as the values, got .*64 of"):
+            torch.ops.kornia_tidy.srgb(torch.zeros(2), False, torch.zeros(1).double())
 
 
 @pytest.mark.parametrize("encode", [False, True])

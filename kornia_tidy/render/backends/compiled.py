@@ -164,7 +164,7 @@ def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs
     if wants_gradient(weight) or (places and wanted[0]):
         return (BatchedBackend() if scene.field is None else DenseBackend()).gradients(scene, gradient)
     with torch.no_grad():
-        found = occlusion_direct_gradients(*planes[:-1], gradient, places, wanted)
+        found = occlusion_direct_gradients(*planes, gradient, wanted)
     return list(zip((x for x, want in zip(tensors, wanted, strict=True) if want and x is not None), found, strict=True))
 
 
