@@ -15,8 +15,6 @@
 //
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
-#include <stdlib.h>
-
 #include "vectors.h"
 
 enum { ROWS = 4, WIDTH = 2 * LANES };
@@ -53,37 +51,32 @@ typedef struct {
     int sums;          // whether any PSF takes sums
 } terms;
 
-static void free_terms(terms *t) { free(t->first), free(t->summed), free(t->offsets), free(t->weights); }
-
-// Lists the terms of all PSFs; `pitch` is that of the sums. Returns whether there is memory for them.
-static int list_terms(const scene *s, int64_t pitch, terms *t) {
+// Lists the terms of all PSFs, if there is memory for them; `pitch` is that of the sums.
+static terms list_terms(pool *p, const scene *s, int64_t pitch) {
     const int64_t psfs = s->layers * s->channels, side = s->side, most = side * (side / 2 + 1);  // runs of one PSF
-    t->first = calloc(psfs * RUN + 1, sizeof(int64_t));
-    t->summed = calloc(psfs, 1);
-    t->offsets = malloc(psfs * most * sizeof(int64_t));
-    t->weights = malloc(psfs * most * RUN * sizeof(REAL));
-    REAL *column = malloc((side + 1) * sizeof(REAL));
-    int taken = t->first && t->summed && t->offsets && t->weights && column;
+    terms t = {take_zeros(p, psfs * RUN + 1, sizeof(int64_t)), take(p, psfs, 1), take(p, psfs * most, sizeof(int64_t)),
+               take(p, psfs * most * RUN, sizeof(REAL)), 0};
+    REAL *column = take(p, side + 1, sizeof(REAL));
     int64_t end = 0;
-    for (int64_t p = 0; taken && p < psfs; p++) {
-        const REAL *psf = s->psfs + p * side * side;
-        int64_t samples = 0, ends = 0, *first = t->first + p * RUN;
+    for (int64_t n = 0; !p->missing && n < psfs; n++) {
+        const REAL *psf = s->psfs + n * side * side;
+        int64_t samples = 0, ends = 0, *first = t.first + n * RUN;
         for (int64_t j = 0; j < side; j++, psf += side) {
             for (int64_t r = 0; r < side; r++) samples += psf[r] != 0, ends += psf[r] != (r ? psf[r - 1] : 0);
             ends += psf[side - 1] != 0;
         }
-        const int summed = t->summed[p] = ends < samples;
-        t->sums |= summed;
+        const int summed = t.summed[n] = ends < samples;
+        t.sums |= summed;
         for (int length = 1; length <= RUN; length++) {
-            psf = s->psfs + p * side * side;
+            psf = s->psfs + n * side * side;
             for (int64_t j = 0; j < side; j++, psf += side) {
                 for (int64_t r = 0; r <= side; r++)
                     column[r] = summed ? (r ? psf[r - 1] : 0) - (r < side ? psf[r] : 0) : r < side ? psf[r] : 0;
                 for (int64_t r = 0, next; r <= side; r = next) {
                     for (next = r; next <= side && next < r + RUN && column[next] != 0;) next++;
                     if (next - r == length) {
-                        t->offsets[end] = r * (summed ? pitch : s->plane_row) + j;
-                        memcpy(t->weights + end++ * RUN, column + r, length * sizeof(REAL));
+                        t.offsets[end] = r * (summed ? pitch : s->plane_row) + j;
+                        memcpy(t.weights + end++ * RUN, column + r, length * sizeof(REAL));
                     }
                     next += next == r;
                 }
@@ -91,8 +84,7 @@ static int list_terms(const scene *s, int64_t pitch, terms *t) {
             first[length] = end;
         }
     }
-    free(column);
-    return taken;
+    return t;
 }
 
 // Adds terms of a PSF, `count` in adjacent rows, to strips: a row of light is loaded once for all rows of a strip.
@@ -240,40 +232,34 @@ INLINE int mix_block(const scene *s, const terms *t, const desk *d, int64_t pitc
 int mix(const scene *s) {
     const int64_t bands = (s->height + TILE_ROWS - 1) / TILE_ROWS, pitch = (TILE_COLUMNS + s->side - 1 + LANES) / LANES * LANES;
     const int64_t plane = (TILE_ROWS + s->side) * pitch;
-    int failed = 0;
-    terms t = {0};
-    if (!list_terms(s, pitch, &t)) failed = NO_MEMORY;
-    else
-#pragma omp parallel num_threads(s->threads)
-    {
-        desk d = {calloc(1, 2 * (s->layers + 1)), aligned_alloc(sizeof(vec), t.sums ? s->channels * plane * sizeof(REAL) : sizeof(vec)),
-                  aligned_alloc(sizeof(vec), s->channels * sizeof *d.total)};
-        const int taken = d.seen && d.sums && d.total;
-        if (!taken) {
+    pool p = {0};
+    const terms t = list_terms(&p, s, pitch);
+    desk desks[s->threads];
+    for (int64_t n = 0; n < s->threads; n++)
+        desks[n] = (desk){take_zeros(&p, 2 * (s->layers + 1), 1), take(&p, t.sums ? s->channels * plane : 0, sizeof(REAL)),
+                          take(&p, s->channels, sizeof *desks->total)};
+    int status = p.missing ? NO_MEMORY : 0;
+    const int64_t count = status ? 0 : s->images * bands;
+#pragma omp parallel for schedule(dynamic) num_threads(s->threads)
+    for (int64_t band = 0; band < count; band++) {
+        const desk *d = desks + thread_number();
+        const int64_t image = band / bands, first = band % bands * TILE_ROWS;
+        const int64_t top = least(first, s->height - ROWS), bottom = least(first + TILE_ROWS, s->height);
+        for (int64_t begin = 0; begin < s->width; begin += TILE_COLUMNS) {
+            const int64_t left = least(begin, s->width - WIDTH), right = least(begin + TILE_COLUMNS, s->width);
+            const REAL *light = s->plane + image * s->plane_image + top * s->plane_row + left;
+            for (int64_t c = 0; t.sums && c < s->channels; c++)
+                sum_columns(light + c * s->plane_channel, s->plane_row, bottom - top + s->side - 1, right - left + s->side - 1,
+                            d->sums + c * plane, pitch);
+            for (int64_t row = first; row < bottom; row += ROWS)
+                for (int64_t column = begin; column < right; column += WIDTH) {
+                    const int64_t y = least(row, s->height - ROWS), x = least(column, s->width - WIDTH);
+                    if (mix_block(s, &t, d, pitch, image, top, left, y, x, row)) continue;
 #pragma omp atomic write
-            failed = NO_MEMORY;
+                    status = REFUSED;
+                }
         }
-#pragma omp for schedule(dynamic)
-        for (int64_t band = 0; band < s->images * bands; band++) {
-            const int64_t image = band / bands, first = band % bands * TILE_ROWS;
-            const int64_t top = least(first, s->height - ROWS), bottom = least(first + TILE_ROWS, s->height);
-            for (int64_t begin = 0; taken && begin < s->width; begin += TILE_COLUMNS) {
-                const int64_t left = least(begin, s->width - WIDTH), right = least(begin + TILE_COLUMNS, s->width);
-                const REAL *light = s->plane + image * s->plane_image + top * s->plane_row + left;
-                for (int64_t c = 0; t.sums && c < s->channels; c++)
-                    sum_columns(light + c * s->plane_channel, s->plane_row, bottom - top + s->side - 1,
-                                right - left + s->side - 1, d.sums + c * plane, pitch);
-                for (int64_t row = first; row < bottom; row += ROWS)
-                    for (int64_t column = begin; column < right; column += WIDTH) {
-                        const int64_t y = least(row, s->height - ROWS), x = least(column, s->width - WIDTH);
-                        if (mix_block(s, &t, &d, pitch, image, top, left, y, x, row)) continue;
-#pragma omp atomic write
-                        failed = REFUSED;
-                    }
-            }
-        }
-        free(d.seen), free(d.sums), free(d.total);
     }
-    free_terms(&t);
-    return failed;
+    free_all(&p);
+    return status;
 }

@@ -41,14 +41,6 @@ static inline void begin_row(lines *l, int64_t row) {
     memset(l->made, 0, l->slots);
 }
 
-// A vector, of which the last `count` numbers may be all.
-INLINE vec load_some(const REAL *from, int64_t count) {
-    vec x = {0};
-    if (count >= LANES) memcpy(&x, from, sizeof x);
-    else memcpy(&x, from, count * sizeof(REAL));
-    return x;
-}
-
 INLINE vec *line_at(const lines *l, int64_t slot, int slope) {
     return l->lines + (slot * 2 + slope) * l->f->node_columns * l->vectors;
 }
@@ -122,13 +114,8 @@ static inline void spread_line(const lines *l, int64_t slot, vec *nodes, int64_t
     }
 }
 
-static inline int take_lines(const field *f, int64_t slots, int64_t numbers, lines *l) {
+static inline lines take_lines(pool *p, const field *f, int64_t slots, int64_t numbers) {
     const int64_t vectors = (numbers + LANES - 1) / LANES;
-    *l = (lines){f, numbers, vectors, 0, 0, slots, -1};
-    if (!f->node_rows) return 1;
-    l->lines = aligned_alloc(sizeof(vec), 2 * slots * f->node_columns * vectors * sizeof(vec));
-    l->made = calloc(slots, 1);
-    return l->lines && l->made;
+    vec *all = take(p, f->node_rows ? 2 * slots * f->node_columns * vectors : 0, sizeof(vec));
+    return (lines){f, numbers, vectors, all, take_zeros(p, slots, 1), slots, -1};
 }
-
-static inline void free_lines(lines *l) { free(l->lines), free(l->made); }

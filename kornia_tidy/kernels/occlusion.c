@@ -19,8 +19,6 @@
 //
 // Compiled by build.py with REAL as float or double.
 
-#include <stdlib.h>
-
 #include "vectors.h"
 #include "field.h"
 
@@ -99,8 +97,6 @@ typedef struct {
     lines psfs;         // of a row of tiles, by layer and channel
     vec *psf;           // of a tile, (ORDERS, vectors), and
     double *tables;     // their tables
-    void *last;         // buffer that was taken, which begins with the address of the one before it
-    int ok;             // whether there was memory for all
 } workspace;
 
 // ---- Tables: partial sums over the ends of a PSF's rows, by which the blur of a run is a difference of two entries.
@@ -505,8 +501,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
         for (int64_t y = rows.from; y < rows.to; y++) {
             REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + columns.from;
             const REAL *from = (const REAL *)&total[c][y - rows.at] + first;
-            if (count == LANES) memcpy(out, from, sizeof(vec));
-            else memcpy(out, from, count * sizeof(REAL));
+            store_some(out, from, count);
         }
 }
 
@@ -538,48 +533,25 @@ static void count_block(const scene_parameters *s, workspace *d, int64_t x, int6
 
 // ---- Workspaces.
 
-static void *take(workspace *d, int64_t bytes) {
-    char *memory = aligned_alloc(64, 64 + (bytes + 127) / 64 * 64);
-    d->ok &= memory != 0;
-    if (!memory) return 0;
-    memset(memory, 0, 64 + bytes);
-    *(void **)memory = d->last;
-    d->last = memory;
-    return memory + 64;
-}
-
-static int allocate_workspace(const scene_parameters *s, workspace *d) {
-    int64_t rows = s->side + BAND - 1, span = s->side + LANES - 1, pitch = window_pitch(s);
-    outline *o = &d->outline;
-    d->last = 0, d->ok = 1, d->window = 0;
-    d->runs = take(d, rows * (s->width + s->side) * sizeof(run));
-    d->made = take(d, rows * sizeof *d->made);
-    d->heads = take(d, rows * sizeof *d->heads);
-    d->members = take(d, (s->layers + 1) * sizeof *d->members);
-    d->stamps = take(d, (s->layers + 1) * sizeof *d->stamps);
-    for (int n = 0; n < 3; n++) d->rows[n] = take(d, rows * pitch * sizeof(REAL));
-    d->nothing = take(d, pitch * sizeof(REAL));
-    d->rays = take(d, rows * sizeof(ray));
-    d->total = take(d, s->channels * sizeof *d->total);
-    d->through = take(d, s->channels * sizeof *d->through);
-    o->light = take(d, rows * sizeof(ray));
-    o->lower = take(d, rows * sizeof(ray));
-    o->upper = take(d, rows * sizeof(ray));
-    o->own.columns = take(d, rows * span * sizeof(edge));
-    o->behind.columns = take(d, rows * span * sizeof(edge));
-    o->own.rows = take(d, rows * sizeof(edge));
-    o->behind.rows = take(d, rows * sizeof(edge));
-    d->kept = take(d, (s->gradient ? (s->layers + 1) * s->channels : 1) * sizeof *d->kept);
-    d->ok &= take_lines(&s->over, s->layers * s->channels, s->side * s->side, &d->psfs);
-    d->psf = take(d, ORDERS * d->psfs.vectors * sizeof(vec));
-    d->tables = take(d, (s->over.node_rows ? ORDERS : 0) * table_size(s) * sizeof(double));
-    for (int64_t r = 0; d->ok && r < rows; r++) d->made[r] = -1;
-    return d->ok;
-}
-
-static void free_workspace(workspace *d) {
-    for (void *own = d->last, *before; own; own = before) before = *(void **)own, free(own);
-    free_lines(&d->psfs);
+static workspace take_workspace(pool *p, const scene_parameters *s) {
+    const int64_t rows = s->side + BAND - 1, ends = rows * (s->side + LANES - 1), pitch = window_pitch(s);
+    workspace d = {.psfs = take_lines(p, &s->over, s->layers * s->channels, s->side * s->side)};
+    outline *o = &d.outline;
+    d.runs = take(p, rows * (s->width + s->side), sizeof(run));
+    d.made = take(p, rows, sizeof *d.made), d.heads = take(p, rows, sizeof *d.heads);
+    d.members = take(p, s->layers + 1, sizeof *d.members), d.stamps = take_zeros(p, s->layers + 1, sizeof *d.stamps);
+    for (int n = 0; n < 3; n++) d.rows[n] = take_zeros(p, rows * pitch, sizeof(REAL));
+    d.nothing = take_zeros(p, pitch, sizeof(REAL));
+    d.total = take(p, s->channels, sizeof *d.total), d.through = take(p, s->channels, sizeof *d.through);
+    d.rays = take(p, rows, sizeof(ray)), o->light = take(p, rows, sizeof(ray));
+    o->lower = take(p, rows, sizeof(ray)), o->upper = take(p, rows, sizeof(ray));
+    o->own.columns = take(p, ends, sizeof(edge)), o->behind.columns = take(p, ends, sizeof(edge));
+    o->own.rows = take(p, rows, sizeof(edge)), o->behind.rows = take(p, rows, sizeof(edge));
+    d.kept = take(p, s->gradient ? (s->layers + 1) * s->channels : 0, sizeof *d.kept);
+    d.psf = take(p, ORDERS * d.psfs.vectors, sizeof(vec));
+    d.tables = take(p, (s->over.node_rows ? ORDERS : 0) * table_size(s), sizeof(double));
+    for (int64_t r = 0; !p->missing && r < rows; r++) d.made[r] = -1;
+    return d;
 }
 
 // How many tables all blocks share: none where they have PSFs of their own.
@@ -626,41 +598,37 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
 }
 
 // Counts the operations of every `every`-th band as of vectors of 64 bytes, which costs are known for. Only what a pair
-// takes, the outline of a layer and its masks, is as much for narrow vectors. Returns 0, or 1 if there is no memory.
+// takes, the outline of a layer and its masks, is as much for narrow vectors. Returns 0 or NO_MEMORY.
 int count(const scene_parameters *s) {
-    const int64_t bands = s->images * bands_of(s), every = s->every;
-    int64_t *counts = s->counts;
-    workspace d;
-    int ok = allocate_workspace(s, &d);
-    for (int64_t n = every / 2; ok && n < bands; n += every) lay_band(s, &d, 0, n, counts);
+    pool p = {0};
+    workspace d = take_workspace(&p, s);
+    const int64_t bands = p.missing ? 0 : s->images * bands_of(s);
+    for (int64_t n = s->every / 2; n < bands; n += s->every) lay_band(s, &d, 0, n, s->counts);
     for (int n = 0; n < COUNTS; n++)
-        if (n != PAIRS) counts[n] = counts[n] * VECTOR_BYTES / 64;
-    free_workspace(&d);
-    return !ok;
+        if (n != PAIRS) s->counts[n] = s->counts[n] * VECTOR_BYTES / 64;
+    free_all(&p);
+    return p.missing ? NO_MEMORY : 0;
 }
 
-// Renders a scene by occlusion-aware compositing of its layers. Returns 0, or 1 if there is no memory.
+static double *take_tables(pool *p, const scene_parameters *s) {
+    double *tables = take(p, tables_of(s) * table_size(s), sizeof(double));
+    const int64_t count = tables ? tables_of(s) : 0;
+#pragma omp parallel for num_threads(s->threads)
+    for (int64_t n = 0; n < count; n++) fill_table(s, s->psfs + n * s->side * s->side, tables + n * table_size(s));
+    return tables;
+}
+
+// Renders a scene by occlusion-aware compositing of its layers. Returns 0 or NO_MEMORY.
 int occlude(const scene_parameters *s) {
-    int64_t bands = bands_of(s), all = tables_of(s), failed = 0;
-    double *tables = malloc((all + 1) * table_size(s) * sizeof(double));
-    if (!tables) return 1;
-#pragma omp parallel num_threads(s->threads)
-    {
-#pragma omp for
-        for (int64_t n = 0; n < all; n++) fill_table(s, s->psfs + n * s->side * s->side, tables + n * table_size(s));
-        workspace d;
-        int ok = allocate_workspace(s, &d);
-        if (!ok) {
-#pragma omp atomic write
-            failed = 1;
-        }
-#pragma omp for schedule(dynamic, 4)
-        for (int64_t n = 0; n < s->images * bands; n++)
-            if (ok) lay_band(s, &d, tables, n, 0);
-        free_workspace(&d);
-    }
-    free(tables);
-    return failed;
+    pool p = {0};
+    const double *tables = take_tables(&p, s);
+    workspace spaces[s->threads];
+    for (int64_t n = 0; n < s->threads; n++) spaces[n] = take_workspace(&p, s);
+    const int64_t bands = p.missing ? 0 : s->images * bands_of(s);
+#pragma omp parallel for schedule(dynamic, 4) num_threads(s->threads)
+    for (int64_t n = 0; n < bands; n++) lay_band(s, spaces + thread_number(), tables, n, 0);
+    free_all(&p);
+    return p.missing ? NO_MEMORY : 0;
 }
 
 // ---- Gradients of the light, of the PSFs and of stray light. Each block is rendered again.
@@ -669,12 +637,12 @@ enum { LINES = 4, SPAN = REGISTERS / 8 };  // rows of a PSF, and vectors of each
 
 // Gradients of a thread, by layer and channel.
 typedef struct {
-    double *tables, *psfs, *veil, *mean;
+    double *tables, *psfs, *veil, *mean;  // the last three one after the other
     REAL *light;  // of the plane
     REAL *rows;   // of a window, which a block's light is spread to, by
     REAL *psf;    // a PSF with BAND - 1 zeros above and below it, columns first
-    REAL *band;  // of PSFs, (LINES side / LINES, pitch) rounded up, of the blocks of one band
-    char *met;   // whether a block of the band has the layer
+    REAL *band;   // of PSFs, (LINES side / LINES, pitch) rounded up, of the blocks of one band
+    char *met;    // whether a block of the band has the layer
     int64_t pitch, size;
     lines lines;  // of a row of tiles, and
     vec *nodes;   // of all of them, with PSFs over the field
@@ -684,28 +652,23 @@ static int64_t plane_numbers(const scene_parameters *s) {
     return s->images * s->channels * (s->height + s->side - 1) * (s->width + s->side - 1);
 }
 
-static int allocate_tally(const scene_parameters *s, tally *t) {
-    const int64_t planes = s->layers * s->channels, area = s->side * s->side;
-    t->pitch = (s->side + LANES - 1) / LANES * LANES;
-    t->size = (s->side + LINES - 1) / LINES * LINES * t->pitch;
-    t->tables = calloc(planes * (table_size(s) + area + 1), sizeof(double));
-    t->psfs = t->tables + planes * table_size(s), t->veil = t->psfs + planes * area;
-    t->band = calloc(planes * t->size, sizeof(REAL));
-    t->mean = calloc(s->images * s->channels, sizeof(double));
-    t->light = calloc(s->plane_gradient ? plane_numbers(s) : 1, sizeof(REAL));
-    t->rows = malloc((s->side + BAND - 1) * window_pitch(s) * sizeof(REAL));
-    t->psf = calloc(s->side * (s->side + 2 * BAND - 2), sizeof(REAL));
-    t->met = calloc(s->layers, 1);
-    const int taken = take_lines(&s->over, planes, area, &t->lines);
-    const int64_t vectors = s->over.node_rows * s->over.node_columns * planes * t->lines.vectors;
-    t->nodes = aligned_alloc(sizeof(vec), (vectors + 1) * sizeof(vec));
-    if (t->nodes) memset(t->nodes, 0, vectors * sizeof(vec));
-    return taken && t->tables && t->band && t->mean && t->light && t->rows && t->psf && t->met && t->nodes;
-}
+// Of nodes over the field, or one.
+static int64_t nodes_of(const scene_parameters *s) { return s->over.node_rows ? s->over.node_rows * s->over.node_columns : 1; }
 
-static void free_tally(tally *t) {
-    free(t->tables), free(t->band), free(t->mean), free(t->light), free(t->rows), free(t->psf), free(t->met), free(t->nodes);
-    free_lines(&t->lines);
+static tally take_tally(pool *p, const scene_parameters *s) {
+    const int64_t planes = s->layers * s->channels, area = s->side * s->side, pitch = (s->side + LANES - 1) / LANES * LANES;
+    tally t = {.pitch = pitch, .size = (s->side + LINES - 1) / LINES * LINES * pitch, .lines = take_lines(p, &s->over, planes, area)};
+    const int64_t numbers = nodes_of(s) * planes * area;
+    t.tables = take_zeros(p, planes * table_size(s), sizeof(double));
+    t.psfs = take_zeros(p, numbers + planes + s->images * s->channels, sizeof(double));
+    t.veil = t.psfs + numbers, t.mean = t.veil + planes;
+    t.band = take_zeros(p, planes * t.size, sizeof(REAL));
+    t.light = take_zeros(p, s->plane_gradient ? plane_numbers(s) : 0, sizeof(REAL));
+    t.rows = take(p, (s->side + BAND - 1) * window_pitch(s), sizeof(REAL));
+    t.psf = take_zeros(p, s->side * (s->side + 2 * BAND - 2), sizeof(REAL));
+    t.met = take_zeros(p, s->layers, 1);
+    t.nodes = take_zeros(p, nodes_of(s) * planes * t.lines.vectors, sizeof(vec));
+    return t;
 }
 
 // Adds the products of a row of light, the r-th, with the block's rows that it meets for lines `first` to `last`.
@@ -947,53 +910,41 @@ static void go_back(const scene_parameters *s, workspace *d, tally *t, const dou
     memset(t->met, 0, s->layers);
 }
 
-// Computes the gradients that are asked for from that of the light; over the field only those of PSFs. Each thread sums bands, always the same ones, and
-// threads are summed in their order. Returns 0, or 1 if there is no memory.
+// Sums numbers of all threads in their order, from one of those at `psfs` on.
+static void sum_threads(const scene_parameters *s, const tally *tallies, int64_t first, int64_t count, REAL *out) {
+    for (int64_t n = 0; out && n < count; n++) {
+        double sum = 0;
+        for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].psfs[first + n];
+        out[n] = sum;
+    }
+}
+
+// Computes the gradients that are asked for from that of the light; over the field only those of PSFs. Each thread sums bands,
+// always the same ones, and threads are summed in their order. Returns 0 or NO_MEMORY.
 int occlusion_gradients(const scene_parameters *s) {
-    const int64_t bands = s->images * bands_of(s), all = s->layers * s->channels, area = s->side * s->side;
-    double *tables = malloc((tables_of(s) + 1) * table_size(s) * sizeof(double));
-    tally *tallies = calloc(s->threads, sizeof *tallies);
-    int failed = !tables || !tallies;
-    if (!failed) {
+    const int64_t all = s->layers * s->channels, area = s->side * s->side, numbers = nodes_of(s) * all * area;
+    pool p = {0};
+    const double *tables = take_tables(&p, s);
+    workspace spaces[s->threads];
+    tally tallies[s->threads];
+    for (int64_t n = 0; n < s->threads; n++) spaces[n] = take_workspace(&p, s), tallies[n] = take_tally(&p, s);
+    const int64_t bands = s->images * bands_of(s), threads = p.missing ? 0 : s->threads;
 #pragma omp parallel for schedule(static, 1) num_threads(s->threads)
-        for (int64_t n = 0; n < tables_of(s); n++) fill_table(s, s->psfs + n * area, tables + n * table_size(s));
-#pragma omp parallel for schedule(static, 1) num_threads(s->threads)
-        for (int64_t thread = 0; thread < s->threads; thread++) {
-            workspace d;
-            tally *t = tallies + thread;
-            const int ready = allocate_workspace(s, &d) & allocate_tally(s, t);
-            if (!ready) {
-#pragma omp atomic write
-                failed = 1;
-            }
-            for (int64_t n = bands * thread / s->threads; ready && n < bands * (thread + 1) / s->threads; n++)
-                go_back(s, &d, t, tables, n);
-            for (int64_t n = 0; ready && n < tables_of(s); n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
-            free_workspace(&d);
-        }
+    for (int64_t thread = 0; thread < threads; thread++) {
+        tally *t = tallies + thread;
+        for (int64_t n = bands * thread / threads; n < bands * (thread + 1) / threads; n++) go_back(s, spaces + thread, t, tables, n);
+        for (int64_t n = 0; n < tables_of(s); n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
+        for (int64_t n = 0; s->over.node_rows && n < numbers; n++)
+            t->psfs[n] = ((REAL *)t->nodes)[n / area * t->lines.vectors * LANES + n % area];
     }
-    for (int64_t n = 0; !failed && n < s->over.node_rows * s->over.node_columns * all * area; n++) {
-        const int64_t at = n / area * tallies->lines.vectors * LANES + n % area;
-        double sum = 0;
-        for (int64_t thread = 0; thread < s->threads; thread++) sum += ((REAL *)tallies[thread].nodes)[at];
-        s->psf_gradient[n] = sum;
+    if (threads) {
+        sum_threads(s, tallies, 0, numbers, s->psf_gradient);
+        sum_threads(s, tallies, numbers, all, s->veil_gradient);
+        sum_threads(s, tallies, numbers + all, s->images * s->channels, s->mean_gradient);
     }
-    for (int64_t n = 0; !failed && !s->over.node_rows && n < all * (area + 1); n++) {
-        double sum = 0;
-        for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].psfs[n];  // `veil` follows `psfs`
-        if (n >= all * area && s->veil_gradient) s->veil_gradient[n - all * area] = sum;
-        else if (n < all * area && s->psf_gradient) s->psf_gradient[n] = sum;
-    }
-    for (int64_t n = 0; !failed && s->plane_gradient && n < plane_numbers(s); n++) {
-        s->plane_gradient[n] = tallies->light[n];
-        for (int64_t thread = 1; thread < s->threads; thread++) s->plane_gradient[n] += tallies[thread].light[n];
-    }
-    for (int64_t n = 0; !failed && s->mean_gradient && n < s->images * s->channels; n++) {
-        double sum = 0;
-        for (int64_t thread = 0; thread < s->threads; thread++) sum += tallies[thread].mean[n];
-        s->mean_gradient[n] = sum;
-    }
-    for (int64_t thread = 0; tallies && thread < s->threads; thread++) free_tally(tallies + thread);
-    free(tables), free(tallies);
-    return failed;
+    for (int64_t thread = 0; thread < threads && s->plane_gradient; thread++)
+        for (int64_t n = 0; n < plane_numbers(s); n++)
+            s->plane_gradient[n] = tallies[thread].light[n] + (thread ? s->plane_gradient[n] : 0);
+    free_all(&p);
+    return p.missing ? NO_MEMORY : 0;
 }

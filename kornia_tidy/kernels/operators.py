@@ -43,8 +43,9 @@ def operator(
 
     Example:
         >>> from kornia_tidy.kernels.gather_ops import gather_direct
-        >>> gather_direct.name(), str(gather_direct._schema)[-56:]
-        ('kornia_tidy::gather_direct', 'bool correlate=False, bool weight_gradient=False) -> Tensor')
+        >>> str(gather_direct._schema).split("Tensor?")
+        ['kornia_tidy::gather_direct(Tensor plane, Tensor psfs, Tensor layer_index, ',
+         ' layer_weight=None, bool correlate=False, bool weight_gradient=False) -> Tensor']
     """
 
     def defined(function: Any) -> Any:
@@ -168,7 +169,7 @@ def strided(tensor: Tensor | None, axes: int = 4) -> tuple[Any, ...]:
     """Return a tensor whose rows are dense with its strides along the other axes: as many fields for :func:`call`.
 
     Example:
-        >>> strided(torch.ones(3, 5).T.expand(2, -1, -1))[1:], strided(None, 3)
+        >>> strided(torch.ones(5, 3).expand(2, -1, -1))[1:], strided(None, 3)
         ((0, 3), (None, 0, 0))
     """
     if tensor is None:

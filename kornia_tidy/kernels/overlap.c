@@ -16,10 +16,6 @@
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
 #include <math.h>
-#include <stdlib.h>
-#ifdef __linux__
-#include <sys/mman.h>
-#endif
 
 #include "vectors.h"
 #include "field.h"
@@ -223,7 +219,6 @@ typedef struct {
     int64_t groups, bands, waves;                   // LANES columns of waves, LANES rows, waves in a row
     transform in_rows, in_columns;
     REAL scale;                                     // of a transform there and back
-    REAL *numbers;                                  // of the transforms
     wave *turns;                                    // (groups,): exp(i pi j / columns)
     uint8_t *needed;                                // (tiles, layers, groups): whether a layer has pixels there
     int64_t *place;                                 // (layers,): of a layer's spectrum, -1 for layers without pixels
@@ -300,21 +295,16 @@ static void analyse(const work *w, const vec *light, wave *column, wave *spectru
 }
 
 // Multiplies by a spectrum, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
-INLINE void multiply_by(const wave *x, const wave *psf, int64_t count, REAL sign, int add, wave *product) {
+static void multiply(const wave *x, const wave *psf, int64_t count, int sign, int add, wave *product) {
     for (int64_t k = 0; k < count; k++) {
-        vec im = sign * psf[k].im;
-        wave z = {x[k].re * psf[k].re - x[k].im * im, x[k].re * im + x[k].im * psf[k].re};
+        const vec im = (REAL)sign * psf[k].im;
+        const wave z = {x[k].re * psf[k].re - x[k].im * im, x[k].re * im + x[k].im * psf[k].re};
         product[k] = add ? sum(product[k], z) : z;
     }
 }
 
-// Multiplies by the spectrum of a PSF as above.
-INLINE void multiply(const tiles *s, const wave *x, const wave *psf, int64_t count, int add, wave *product) {
-    if (s->correlate && add) multiply_by(x, psf, count, -1, 1, product);
-    else if (s->correlate) multiply_by(x, psf, count, -1, 0, product);
-    else if (add) multiply_by(x, psf, count, 1, 1, product);
-    else multiply_by(x, psf, count, 1, 0, product);
-}
+// The sign for the spectrum of a PSF.
+INLINE int sign_of(const tiles *s) { return s->correlate ? -1 : 1; }
 
 // Transforms a row of waves back and hands it on to the columns that are needed.
 static void row_back(const work *w, wave *row, int64_t band, const uint8_t *needed, wave *half) {
@@ -334,8 +324,7 @@ static void cut(const work *w, const REAL *from, int64_t pitch, int64_t height, 
             const int64_t lane = column % LANES, count = least(LANES - lane, width - x);
             REAL *target = (REAL *)(to + column / LANES * rows + origin + y) + lane;
             __builtin_prefetch(from + (y + ROWS_AHEAD) * pitch + x);
-            if (count == LANES) memcpy(target, from + y * pitch + x, sizeof(vec));
-            else memcpy(target, from + y * pitch + x, count * sizeof(REAL));
+            store_some(target, from + y * pitch + x, count);
             x += count, column += count;
         }
 }
@@ -405,8 +394,7 @@ static void write_sums(const work *w, tile t, int64_t channel, const desk *d) {
         for (int64_t x = 0, column = s->origin; x < t.width;) {
             const int64_t lane = column % LANES, count = least(LANES - lane, t.width - x);
             const REAL *from = (const REAL *)(d->sums + column / LANES * s->rows + s->origin + y) + lane;
-            if (count == LANES) memcpy(out + y * s->width + x, from, sizeof(vec));
-            else memcpy(out + y * s->width + x, from, count * sizeof(REAL));
+            store_some(out + y * s->width + x, from, count);
             x += count, column += count;
         }
 }
@@ -444,16 +432,8 @@ INLINE void add_columns(const work *w, int64_t g, const wave *column, const wave
             vec value = unturned(column[y], turn, side);
             if (sloped) value += (steps() + (first - middle)) * unturned(sloped[y], turn, side);
             REAL *target = out + y * pitch + first;
-            vec there = {0};
-            if (count == LANES) {
-                memcpy(&there, target, sizeof(vec));
-                there += value;
-                memcpy(target, &there, sizeof(vec));
-            } else {
-                memcpy(&there, target, count * sizeof(REAL));
-                there += value;
-                memcpy(target, &there, count * sizeof(REAL));
-            }
+            value += load_some(target, count);
+            store_some(target, &value, count);
         }
     }
 }
@@ -538,7 +518,7 @@ static void gather_tile(const work *w, int64_t channel, tile t, desk *d) {
         for (int64_t band = 0; band < w->bands; band++) {
             const int64_t k = band * w->waves;
             for (int order = 0; order < ORDERS; order++)
-                if (t.has[order]) multiply(s, light[order] + k, psf + order * all + k, w->waves, order, d->row);
+                if (t.has[order]) multiply(light[order] + k, psf + order * all + k, w->waves, sign_of(s), order, d->row);
             row_back(w, d->row, band, needed, d->half);
         }
         for (int64_t g = 0; g < w->groups; g++)
@@ -565,7 +545,7 @@ static void scatter_tile(const work *w, int64_t channel, tile t, desk *d) {
         for (int64_t k = 0; k < all; k += w->waves) {
             forward(d->spectrum + k, &w->in_rows);
             for (int order = 0; order < ORDERS; order++)
-                if (t.has[order]) multiply(s, d->spectrum + k, psf + order * all + k, w->waves, 1, totals[order] + k);
+                if (t.has[order]) multiply(d->spectrum + k, psf + order * all + k, w->waves, sign_of(s), 1, totals[order] + k);
         }
     }
     const int64_t height = s->height + s->side - 1, width = s->width + s->side - 1;
@@ -639,8 +619,7 @@ static void correlate_tile(const work *w, int64_t channel, tile t, desk *d, wave
             for (int order = 0; order < ORDERS; order++) {
                 if (!t.has[order]) continue;
                 const wave *x = light[order] + k;
-                if (s->correlate) multiply_by(x, row, w->waves, -1, !over_field, found + order * all + k);
-                else multiply_by(row, x, w->waves, -1, !over_field, found + order * all + k);
+                multiply(s->correlate ? x : row, s->correlate ? row : x, w->waves, -1, !over_field, found + order * all + k);
             }
         }
         if (over_field) add_to_line(w, t, layer, d);
@@ -794,120 +773,71 @@ static void correlate_rows(const work *w, int64_t channel, desk *desks) {
     }
 }
 
-// Memory for vectors; much of it in huge pages where the system has them, because columns jump from page to page.
-static void *take(int64_t count, size_t size) {
-    const size_t huge = 2 << 20, unit = count * size < 2 * huge ? sizeof(vec) : huge;
-    const size_t bytes = (count * size + unit - 1) / unit * unit;
-    void *memory = aligned_alloc(unit, bytes ? bytes : unit);
-#ifdef MADV_HUGEPAGE
-    if (memory && unit == huge) madvise(memory, bytes, MADV_HUGEPAGE);
-#endif
-    return memory;
-}
-
-static int take_desk(const work *w, desk *d) {
-    const int64_t plane = 2 * w->groups * w->s->rows, waves = w->bands * w->waves;
-    d->light = take(plane, sizeof(vec));
-    d->label = take(plane, sizeof(vec));
-    d->weight = take(w->s->weight ? plane : 0, sizeof(vec));
-    d->sums = take(plane, sizeof(vec));
-    d->spectrum = take(waves, sizeof(wave));
-    d->total = take(waves, sizeof(wave));
-    const int over_field = w->s->over.node_rows > 0, orders = over_field ? ORDERS : 1;
-    d->half = take(orders * w->groups * w->s->rows, sizeof(wave));
-    d->row = take(w->waves, sizeof(wave));
-    int taken = d->light && d->label && d->weight && d->sums && d->spectrum && d->total && d->half && d->row;
-    taken &= take_lines(&w->s->over, w->s->layers, w->s->side * w->s->side, &d->lines);
-    if (!over_field) return taken;
-    d->flat = take(ORDERS * d->lines.vectors + psf_groups(w->s), sizeof(vec));  // the last row is read beyond its end
-    d->samples = take(ORDERS * psf_groups(w->s) * w->s->side, sizeof(vec));
-    d->moments = take(2 * waves, sizeof(wave));
-    d->psf = take(ORDERS * waves, sizeof(wave));
-    return taken && d->flat && d->samples && d->moments && d->psf;
-}
-
-static void free_desk(desk *d) {
-    free(d->light);
-    free(d->label);
-    free(d->weight);
-    free(d->sums);
-    free(d->spectrum);
-    free(d->total);
-    free(d->half);
-    free(d->row);
-    free_lines(&d->lines);
-    free(d->flat);
-    free(d->samples);
-    free(d->moments);
-    free(d->psf);
-}
-
-// Computes in memory that was taken. Returns as the functions below.
-static int compute_in(work *w, desk *desks, int kind) {
+static desk take_desk(pool *p, const work *w) {
     const tiles *s = w->s;
-    if (!note_layers(w)) return REFUSED;
-    plan(&w->in_columns, s->rows, plan(&w->in_rows, w->waves, w->numbers));
-    for (int64_t j = 0; j < w->waves; j++) {
-        w->turns[j / LANES].re[j % LANES] = cos(M_PI * (double)j / (double)s->columns);
-        w->turns[j / LANES].im[j % LANES] = sin(M_PI * (double)j / (double)s->columns);
-    }
-    const int64_t present = place_layers(w), slabs = kind == CORRELATE ? s->threads : 1;
-    const field *f = &s->over;
-    if (!f->node_rows) w->psfs = take(slabs * present * w->bands * w->waves, sizeof(wave));
-    else w->psfs = take(kind == CORRELATE ? slabs * f->node_rows * f->node_columns * s->layers * desks->lines.vectors : 0, sizeof(vec));
-    if (!w->psfs) return NO_MEMORY;
-    for (int64_t channel = 0; channel < s->channels; channel++) {
-        if (kind == CORRELATE && f->node_rows) correlate_rows(w, channel, desks);
-        else if (kind == CORRELATE) correlate_tiles(w, channel, desks, present);
-        else {
-            if (!f->node_rows) transform_psfs(w, channel, desks);
-            render_tiles(w, channel, desks, kind);
-        }
-    }
-    free(w->psfs);
-    return 0;
+    const int64_t plane = 2 * w->groups * s->rows, waves = w->bands * w->waves, over_field = s->over.node_rows > 0;
+    const int64_t orders = over_field ? ORDERS : 1, psf = over_field * psf_groups(s);
+    desk d = {.lines = take_lines(p, &s->over, s->layers, s->side * s->side)};
+    d.light = take(p, plane, sizeof(vec)), d.label = take(p, plane, sizeof(vec)), d.sums = take(p, plane, sizeof(vec));
+    d.weight = take(p, s->weight ? plane : 0, sizeof(vec));
+    d.spectrum = take(p, waves, sizeof(wave)), d.total = take(p, waves, sizeof(wave)), d.row = take(p, w->waves, sizeof(wave));
+    d.half = take(p, orders * w->groups * s->rows, sizeof(wave));
+    d.flat = take(p, over_field * ORDERS * d.lines.vectors + psf, sizeof(vec));  // the last row is read beyond its end
+    d.samples = take(p, ORDERS * psf * s->side, sizeof(vec));
+    d.moments = take(p, over_field * 2 * waves, sizeof(wave)), d.psf = take(p, over_field * ORDERS * waves, sizeof(wave));
+    return d;
 }
 
 // Where tiles of so many pixels begin, and the end.
-static int64_t *even_edges(int64_t pixels, int64_t side, int64_t count) {
-    int64_t *edges = take(count + 1, sizeof(int64_t));
+static int64_t *even_edges(pool *p, int64_t pixels, int64_t side, int64_t count) {
+    int64_t *edges = take(p, count + 1, sizeof(int64_t));
     for (int64_t n = 0; edges && n <= count; n++) edges[n] = least(n * side, pixels);
     return edges;
 }
 
+// Returns 0, REFUSED if a pixel lies in no layer, or NO_MEMORY.
 static int compute(const tiles *s, int kind) {
     const int64_t height = s->rows - s->side + 1, width = s->columns - s->side + 1;  // of the largest tile
-    work w = {.s = s, .down = s->over.down, .across = s->over.across};
-    int64_t *edges[2] = {0, 0};
-    w.row_edges = s->over.row_edges, w.column_edges = s->over.column_edges;
-    if (!s->over.node_rows) {
+    const field *f = &s->over;
+    pool p = {0};
+    desk desks[s->threads];
+    work w = {.s = s, .down = f->down, .across = f->across, .row_edges = f->row_edges, .column_edges = f->column_edges};
+    if (!f->node_rows) {
         w.down = (s->height + height - 1) / height, w.across = (s->width + width - 1) / width;
-        w.row_edges = edges[0] = even_edges(s->height, height, w.down);
-        w.column_edges = edges[1] = even_edges(s->width, width, w.across);
+        w.row_edges = even_edges(&p, s->height, height, w.down), w.column_edges = even_edges(&p, s->width, width, w.across);
     }
     w.tiles = w.down * w.across;
     w.waves = s->columns / 2, w.groups = w.waves / LANES, w.bands = s->rows / LANES;
     w.scale = 1 / ((REAL)s->rows * (REAL)w.waves);
-    w.numbers = take(4 * (s->rows + w.waves), sizeof(REAL));
-    w.turns = take(w.groups, sizeof(wave));
-    w.place = take(s->layers, sizeof(int64_t));
-    w.needed = calloc(s->images * w.tiles * s->layers, w.groups);
-    desk *desks = calloc(s->threads, sizeof(desk));
-    int taken = desks && w.row_edges && w.column_edges && w.numbers && w.turns && w.place && w.needed;
-    for (int64_t n = 0; taken && n < s->threads; n++) taken = take_desk(&w, desks + n);
-    const int failed = taken ? compute_in(&w, desks, kind) : NO_MEMORY;
-    for (int64_t n = 0; desks && n < s->threads; n++) free_desk(desks + n);
-    free(desks);
-    free(w.numbers);
-    free(w.turns);
-    free(w.place);
-    free(w.needed);
-    free(edges[0]);
-    free(edges[1]);
-    return failed;
+    w.turns = take(&p, w.groups, sizeof(wave)), w.place = take(&p, s->layers, sizeof(int64_t));
+    w.needed = take_zeros(&p, s->images * w.tiles * s->layers, w.groups);
+    REAL *numbers = take(&p, 4 * (s->rows + w.waves), sizeof(REAL));
+    for (int64_t n = 0; n < s->threads; n++) desks[n] = take_desk(&p, &w);
+    int status = p.missing ? NO_MEMORY : note_layers(&w) ? 0 : REFUSED;
+    if (!status) {
+        plan(&w.in_columns, s->rows, plan(&w.in_rows, w.waves, numbers));
+        for (int64_t j = 0; j < w.waves; j++) {
+            w.turns[j / LANES].re[j % LANES] = cos(M_PI * (double)j / (double)s->columns);
+            w.turns[j / LANES].im[j % LANES] = sin(M_PI * (double)j / (double)s->columns);
+        }
+        const int64_t present = place_layers(&w), slabs = kind == CORRELATE ? s->threads : 1;
+        if (!f->node_rows) w.psfs = take(&p, slabs * present * w.bands * w.waves, sizeof(wave));
+        else if (kind == CORRELATE)
+            w.psfs = take(&p, slabs * f->node_rows * f->node_columns * s->layers * desks->lines.vectors, sizeof(vec));
+        status = p.missing ? NO_MEMORY : 0;
+        for (int64_t channel = 0; channel < s->channels && !status; channel++) {
+            if (kind == CORRELATE && f->node_rows) correlate_rows(&w, channel, desks);
+            else if (kind == CORRELATE) correlate_tiles(&w, channel, desks, present);
+            else {
+                if (!f->node_rows) transform_psfs(&w, channel, desks);
+                render_tiles(&w, channel, desks, kind);
+            }
+        }
+    }
+    free_all(&p);
+    return status;
 }
 
-// Return 0, REFUSED if a pixel lies in no layer, or NO_MEMORY.
 int gather(const tiles *s) { return compute(s, GATHER); }
 
 int scatter(const tiles *s) { return compute(s, SCATTER); }

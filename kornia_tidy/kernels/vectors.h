@@ -1,9 +1,14 @@
-// SIMD vectors of REAL, as wide as a register of the processor that the compiler targets; shared by the C sources.
+// SIMD vectors of REAL, as wide as a register of the processor that the compiler targets, and the memory of a call; shared by
+// the C sources.
 
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 #ifdef _OPENMP
 #include <omp.h>
+#endif
+#ifdef __linux__
+#include <sys/mman.h>
 #endif
 
 #ifdef __AVX512F__
@@ -123,4 +128,49 @@ INLINE REAL sum_of(vec lanes) {
     REAL sum = 0;
     for (int i = 0; i < 16 / (int)sizeof(REAL); i++) sum += quarters[0][i];
     return sum;
+}
+
+// A vector of which the first `count` numbers, or all, come from memory; zeros behind them.
+INLINE vec load_some(const REAL *from, int64_t count) {
+    vec x = {0};
+    if (count >= LANES) memcpy(&x, from, sizeof x);
+    else memcpy(&x, from, count * sizeof(REAL));
+    return x;
+}
+
+// Copies as many numbers of a vector, at most all.
+INLINE void store_some(REAL *to, const void *from, int64_t count) {
+    if (count >= LANES) memcpy(to, from, sizeof(vec));
+    else memcpy(to, from, count * sizeof(REAL));
+}
+
+// Buffers of a call, which are freed together; `missing`: there was no memory for one of them.
+typedef struct {
+    void *last;  // begins with the address of the one before it
+    int missing;
+} pool;
+
+enum { ALIGNED = 64, HUGE_PAGE = 2 << 20 };
+
+// A buffer that begins with a whole vector and has one more behind its end; a large one lies in huge pages where the system has
+// them, because columns jump from page to page.
+static inline void *take(pool *p, int64_t count, size_t size) {
+    const size_t bytes = count * size + 2 * ALIGNED, unit = bytes < 2 * HUGE_PAGE ? ALIGNED : HUGE_PAGE, whole = (bytes + unit - 1) / unit * unit;
+    char *memory = aligned_alloc(unit, whole);
+    p->missing |= !memory;
+    if (!memory) return 0;
+#ifdef MADV_HUGEPAGE
+    if (unit == HUGE_PAGE) madvise(memory, whole, MADV_HUGEPAGE);
+#endif
+    *(void **)memory = p->last, p->last = memory;
+    return memory + ALIGNED;
+}
+
+static inline void *take_zeros(pool *p, int64_t count, size_t size) {
+    void *memory = take(p, count, size);
+    return memory ? memset(memory, 0, count * size) : 0;
+}
+
+static inline void free_all(pool *p) {
+    for (void *own = p->last, *before; own; own = before) before = *(void **)own, free(own);
 }
