@@ -99,7 +99,7 @@ static vec *alternate(pool *p, const waves *s) {
 // Computes J or B in packed form: total[n][m] is the sum over rows of left[n] right[m]. Padded rows n are zero.
 static void products(const desk *d, const vec *left, const vec *right, int64_t count, vec *total) {
     for (int64_t n = 0; n < d->rows; n += BLOCK)
-        multiply_block((const REAL *)left + n, d->pitch, right, d->vecs, count, d->vecs, total + n * d->vecs);
+        multiply_block((const REAL *)left + n, d->pitch, 0, right, d->vecs, count, d->vecs, BLOCK, total + n * d->vecs);
 }
 
 // Computes B of a depth's pixels.
@@ -174,7 +174,7 @@ static void add_depth_gradient(const waves *s, int64_t depth, const desk *d) {
         const int64_t lines = least(LINES, window - p);
         for (int64_t x = 0; x < window; x++)
             for (int64_t i = 0; i < lines; i++) d->turned[x * LINES + i] = gradient[(p + i) * window + x];
-        multiply_block(d->turned, LINES, d->pixels, d->plane, window, d->plane, d->intensity);
+        multiply_block(d->turned, LINES, 0, d->pixels, d->plane, window, d->plane, BLOCK, d->intensity);
         for (int64_t i = 0; i < lines; i++) {
             fill_row(s, kernel, p + i, d);
             add_row_gradient(s, d->intensity + i * d->plane, p + i, d);

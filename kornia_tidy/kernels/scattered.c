@@ -12,11 +12,10 @@
 // Compiled by build.py with REAL as float or double; exact to rounding, without fast-math.
 
 #include <math.h>
-#include <stdlib.h>
 
 #include "vectors.h"
+#include "products.h"
 
-enum { BLOCK = 4, SPAN = REGISTERS == 32 ? 6 : 3 };  // rows and vectors of a product that stay in registers
 enum { ROWS = 4 };                                   // of a patch: weights of points are padded to a multiple
 
 // The fields of `_fill` in scattered_ops.py.
@@ -64,8 +63,6 @@ INLINE vec signs(void) {
 // Interleaved complex numbers times i.
 INLINE vec times_i(vec x) { return PICK(x, x, SWAP) * signs(); }
 
-INLINE int64_t padded(int64_t count, int64_t step) { return (count + step - 1) / step * step; }
-
 // ---------------------------------------------------------------------- products with real matrices
 
 // A matrix in blocks of BLOCK rows, the last one padded with zeros, and the columns with other numbers in each block.
@@ -75,51 +72,23 @@ typedef struct {
     int64_t *first, *after;  // (blocks,)
 } matrix;
 
-static int64_t matrix_size(int64_t rows, int64_t inner) {
+// Lays a matrix out, or its transpose, if there is memory for it.
+static matrix lay_out(pool *p, const REAL *from, int64_t rows, int64_t inner, int transposed) {
     const int64_t blocks = (rows + BLOCK - 1) / BLOCK;
-    return blocks * 2 * sizeof(int64_t) + blocks * inner * BLOCK * sizeof(REAL);
-}
-
-// Lays a matrix out in `memory`, or its transpose, and returns the rest of the memory.
-static char *lay_out(matrix *m, const REAL *from, int64_t rows, int64_t inner, int transposed, char *memory) {
-    *m = (matrix){(rows + BLOCK - 1) / BLOCK, inner, 0, 0, 0};
-    m->first = (int64_t *)memory, m->after = m->first + m->blocks, m->numbers = (REAL *)(m->after + m->blocks);
-    for (int64_t b = 0; b < m->blocks; b++) {
-        m->first[b] = inner, m->after[b] = 0;
+    matrix m = {blocks, inner, take(p, blocks * inner * BLOCK, sizeof(REAL)), take(p, blocks, sizeof(int64_t)),
+                take(p, blocks, sizeof(int64_t))};
+    for (int64_t b = 0; !p->missing && b < blocks; b++) {
+        m.first[b] = inner, m.after[b] = 0;
         for (int64_t i = 0; i < inner; i++)
             for (int64_t n = 0; n < BLOCK; n++) {
                 const int64_t row = b * BLOCK + n;
                 const REAL x = row >= rows ? 0 : transposed ? from[i * rows + row] : from[row * inner + i];
-                m->numbers[(b * inner + i) * BLOCK + n] = x;
-                if (x != 0) m->first[b] = least(m->first[b], i), m->after[b] = i + 1;
+                m.numbers[(b * inner + i) * BLOCK + n] = x;
+                if (x != 0) m.first[b] = least(m.first[b], i), m.after[b] = i + 1;
             }
-        m->first[b] = least(m->first[b], m->after[b]);
+        m.first[b] = least(m.first[b], m.after[b]);
     }
-    return memory + matrix_size(rows, inner);
-}
-
-INLINE void add_products(const REAL *numbers, int64_t step, int64_t next, const vec *x, int64_t pitch, int64_t inner, int64_t vecs,
-                         int rows, int count, vec *out) {
-    vec sums[2 * BLOCK][SPAN];
-    memset(sums, 0, sizeof sums);
-    for (int64_t i = 0; i < inner; i++, numbers += step, x += pitch)
-#pragma GCC unroll 8
-        for (int n = 0; n < rows; n++)
-#pragma GCC unroll 6
-            for (int v = 0; v < count; v++) sums[n][v] += numbers[n / BLOCK * next + n % BLOCK] * x[v];
-    for (int n = 0; n < rows; n++)
-        for (int v = 0; v < count; v++) out[n * vecs + v] = sums[n][v];
-}
-
-// out (rows, vecs) = one block of a matrix or two, `next` numbers apart, with a column every few numbers, x rows of vectors.
-INLINE void multiply_block(const REAL *numbers, int64_t step, int64_t next, const vec *x, int64_t pitch, int64_t inner,
-                           int64_t vecs, int rows, vec *out) {
-    const int span = rows == BLOCK ? SPAN : SPAN / 2;
-    int64_t v = 0;
-    for (; v + span <= vecs; v += span) add_products(numbers, step, next, x + v, pitch, inner, vecs, rows, span, out + v);
-#pragma GCC unroll 5
-    for (int rest = span - 1; rest > 0; rest--)
-        if (vecs - v == rest) add_products(numbers, step, next, x + v, pitch, inner, vecs, rows, rest, out + v);
+    return m;
 }
 
 // out (padded rows, vecs) = matrix (rows, inner) x every few rows of (inner, vecs).
@@ -140,30 +109,24 @@ typedef struct {
     vec *table[2], *table_back[2];  // (inner, across), (quarter, upright)
 } axes;
 
-// Lays the transform of cosines or sines out. The middle row and column are their own mirror images: they count twice in
-// sums, and half in what takes them forwards.
-static void lay_out_axes(const scattered *s, const REAL *from, int64_t across, int64_t upright, axes *t, char **memory, vec **tables) {
+// Lays the transform of cosines or sines out, if there is memory for it. The middle row and column are their own mirror images:
+// they count twice in sums, and half in what takes them forwards.
+static axes lay_out_axes(pool *p, const scattered *s, const REAL *from, int64_t across, int64_t upright) {
     const int64_t inner = s->extent / 2 + 1, quarter = s->quarter;
+    REAL *part = take(p, quarter * inner, sizeof(REAL)), *halved = take(p, quarter * inner, sizeof(REAL));
+    axes t;
     for (int odd = 0; odd < 2; odd++) {
         const int64_t count = (inner + 1 - odd) / 2;
-        REAL *part = (REAL *)*tables, *halved = part + quarter * count;
-        for (int64_t k = 0; k < quarter; k++)
-            for (int64_t i = 0; i < count; i++) {
-                part[k * count + i] = from[k * inner + 2 * i + odd];
-                halved[k * count + i] = part[k * count + i] * (REAL)(i || odd ? 1 : 0.5);
-            }
-        *memory = lay_out(t->rows + odd, halved, quarter, count, 0, *memory);
-        *memory = lay_out(t->rows_back + odd, part, count, quarter, 1, *memory);
-        REAL *table = (REAL *)(*tables += (2 * quarter * count + LANES - 1) / LANES);
-        t->table[odd] = (vec *)table, t->table_back[odd] = t->table[odd] + count * across;
-        *tables = t->table_back[odd] + quarter * upright;
-        memset(table, 0, (count * across + quarter * upright) * sizeof(vec));
-        for (int64_t k = 0; k < quarter; k++)
-            for (int64_t i = 0; i < count; i++) {
-                table[i * across * LANES + k] = halved[k * count + i];
-                ((REAL *)t->table_back[odd])[k * upright * LANES + i] = part[k * count + i];
-            }
+        t.table[odd] = take_zeros(p, count * across, sizeof(vec)), t.table_back[odd] = take_zeros(p, quarter * upright, sizeof(vec));
+        for (int64_t n = 0; !p->missing && n < quarter * count; n++) {
+            const int64_t k = n / count, i = n % count;
+            part[n] = from[k * inner + 2 * i + odd], halved[n] = part[n] * (REAL)(i || odd ? 1 : 0.5);
+            ((REAL *)t.table[odd])[i * across * LANES + k] = halved[n];
+            ((REAL *)t.table_back[odd])[k * upright * LANES + i] = part[n];
+        }
+        t.rows[odd] = lay_out(p, halved, quarter, count, 0), t.rows_back[odd] = lay_out(p, part, count, quarter, 1);
     }
+    return t;
 }
 
 // ---------------------------------------------------------------------- points of a place
@@ -181,8 +144,7 @@ typedef struct {
     vec *column_weights;              // (patches, points, vecs), each number twice
     axes cosines, sines;
     matrix *pixels;                   // (exposures, shifts, 4): columns, rows, and the transposes
-    int64_t size;                     // vectors of a desk
-    vec *desks;                       // (threads, size)
+    REAL *parts;                      // (depths, waves and weights): their gradients
 } work;
 
 // Finds the samples that each patch touches, as many for all. Returns whether they lie in the grid.
@@ -586,50 +548,30 @@ static void gather_waves(const work *w, const desk *d, REAL *of_waves) {
     }
 }
 
-// Shares memory out to a thread's desk, and returns the number of vectors that it takes.
-static int64_t share_out(const work *w, vec *memory, desk *d) {
+static desk take_desk(pool *p, const work *w) {
     const scattered *s = w->s;
-    const int64_t inner = s->extent / 2 + 1, samples = padded(s->samples, BLOCK), folded = inner * w->folded + 1;
-    const int64_t set = padded(s->quarter, BLOCK) * w->folded + 1, block = 2 * w->block / LANES;
-    const int64_t part = 2 * BLOCK * w->along;
-    const int64_t sizes[] = {2 * s->patches * s->points / LANES + 3,
-                             s->exposures * s->states * s->extent * w->across + 1,
-                             w->rows * w->vecs,
-                             w->rows * w->vecs,
-                             2 * folded,
-                             4 * set,
-                             2 * block,
-                             4 * part,
-                             samples * 4 * w->along,
-                             padded(s->window, BLOCK) * 4 * w->along,
-                             samples * w->beside,
-                             padded(s->window, BLOCK) * w->beside,
-                             samples * 4 * w->along,
-                             s->quarter * BLOCK / LANES + 1,
-                             2 * BLOCK * w->upright,
-                             padded((inner + 1) / 2, BLOCK) * w->folded};
-    enum { ALL = sizeof sizes / sizeof *sizes };
-    int64_t at[ALL + 1] = {0};
-    for (int n = 0; n < ALL; n++) at[n + 1] = at[n] + sizes[n];
-    if (memory) {
-        *d = (desk){.field = (REAL *)memory, .grids = memory + at[1], .patch = memory + at[2], .turned = memory + at[3],
-                    .light = memory + at[8], .lines = memory + at[9], .turned_lines = memory + at[10], .pixels = memory + at[11],
-                    .of_light = memory + at[12], .turned_parts = (REAL *)(memory + at[13]), .rows_back = memory + at[15]};
-        for (int n = 0; n < 2; n++) {
-            d->folded[n] = memory + at[4] + n * folded, d->blocks[n] = (REAL *)(memory + at[6] + n * block);
-            d->block[n] = memory + at[14] + n * BLOCK * w->upright;
-        }
-        for (int n = 0; n < 4; n++) d->sets[n] = memory + at[5] + n * set, d->parts[n] = memory + at[7] + n * part;
+    const int64_t inner = s->extent / 2 + 1, samples = padded(s->samples, BLOCK), window = padded(s->window, BLOCK);
+    const int64_t quarter = padded(s->quarter, BLOCK), states = s->exposures * s->states;
+    desk d = {.field = take_zeros(p, 2 * s->patches * s->points + LANES, sizeof(REAL))};
+    d.grids = take_zeros(p, states * s->extent * w->across, sizeof(vec));
+    d.patch = take_zeros(p, w->rows * w->vecs, sizeof(vec)), d.turned = take_zeros(p, w->rows * w->vecs, sizeof(vec));
+    for (int n = 0; n < 2; n++) {
+        d.folded[n] = take_zeros(p, inner * w->folded, sizeof(vec)), d.block[n] = take_zeros(p, BLOCK * w->upright, sizeof(vec));
+        d.blocks[n] = take_zeros(p, 2 * w->block, sizeof(REAL));
     }
-    return at[ALL];
+    for (int n = 0; n < 4; n++)
+        d.sets[n] = take_zeros(p, quarter * w->folded, sizeof(vec)), d.parts[n] = take_zeros(p, 2 * BLOCK * w->along, sizeof(vec));
+    d.light = take_zeros(p, samples * 4 * w->along, sizeof(vec)), d.of_light = take_zeros(p, samples * 4 * w->along, sizeof(vec));
+    d.lines = take_zeros(p, window * 4 * w->along, sizeof(vec)), d.turned_lines = take_zeros(p, samples * w->beside, sizeof(vec));
+    d.pixels = take_zeros(p, window * w->beside, sizeof(vec)), d.turned_parts = take_zeros(p, s->quarter * BLOCK, sizeof(REAL));
+    d.rows_back = take_zeros(p, padded((inner + 1) / 2, BLOCK) * w->folded, sizeof(vec));
+    return d;
 }
 
 // One depth of a place: its light, or the gradients, which are added to `of_waves` and `of_weights`.
-static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves, REAL *of_weights) {
+static void compute(const work *w, int64_t place, int64_t depth, const desk *d, REAL *of_waves, REAL *of_weights) {
     const scattered *s = w->s;
-    desk own = {0}, *d = &own;
     const int64_t size = s->shifts * s->window * s->window, out = (place * s->depths + depth) * s->exposures * size;
-    share_out(w, w->desks + thread_number() * w->size, d);
     const int64_t rows = 2 + s->phases + s->amplitudes;
     fill_field(s, s->values + (place * rows + 2) * s->patches * s->points, depth, d->field);
     fill_grids(w, d);
@@ -646,7 +588,7 @@ static void compute(const work *w, int64_t place, int64_t depth, REAL *of_waves,
     if (s->gradient) gather_waves(w, d, of_waves);
 }
 
-static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
+static int compute_place(work *w, int64_t place) {
     const scattered *s = w->s;
     const int64_t total = s->patches * s->points;
     const double *places = s->values + place * (2 + s->phases + s->amplitudes) * total;
@@ -656,56 +598,46 @@ static int compute_place(work *w, int64_t place, char *matrices, REAL *parts) {
     w->across = ((most > 2 * s->extent ? most : 2 * s->extent) + LANES - 1) / LANES;
     w->folded = (2 * s->extent + 2 + LANES - 1) / LANES, w->block = 2 * padded(s->extent + 1, LANES);
     w->beside = (s->window + LANES - 1) / LANES;
-    w->row_weights = malloc(total * w->rows * sizeof(REAL));
-    w->column_weights = aligned_alloc(sizeof(vec), total * w->vecs * sizeof(vec));
-    w->size = share_out(w, 0, 0);
-    w->desks = aligned_alloc(sizeof(vec), s->threads * w->size * sizeof(vec));
-    const int status = w->row_weights && w->column_weights && w->desks ? 0 : NO_MEMORY;
-    if (!status) {
-        memset(w->desks, 0, s->threads * w->size * sizeof(vec));
+    pool p = {0};
+    w->row_weights = take(&p, total * w->rows, sizeof(REAL)), w->column_weights = take(&p, total * w->vecs, sizeof(vec));
+    desk desks[s->threads];
+    for (int64_t n = 0; n < s->threads; n++) desks[n] = take_desk(&p, w);
+    w->pixels = take(&p, 4 * s->exposures * s->shifts, sizeof(matrix));
+    for (int64_t n = 0; !p.missing && n < 4 * s->exposures * s->shifts; n++) {
+        const int64_t at = (place * s->exposures * s->shifts + n / 4) * s->window * s->samples, back = n % 4 >= 2;
+        if (back && !s->gradient) continue;
+        w->pixels[n] = lay_out(&p, (n % 2 ? s->rows : s->columns) + at, back ? s->samples : s->window, back ? s->window : s->samples, back);
+    }
+    if (!p.missing) {
         fill_weights(w, places);
-        for (int64_t v = 0; v < s->exposures * s->shifts; v++) {
-            const int64_t at = (place * s->exposures * s->shifts + v) * s->window * s->samples;
-            for (int n = 0; n < (s->gradient ? 4 : 2); n++)
-                matrices = lay_out(w->pixels + 4 * v + n, (n % 2 ? s->rows : s->columns) + at, n < 2 ? s->window : s->samples,
-                                   n < 2 ? s->samples : s->window, n >= 2, matrices);
-        }
         const int64_t waves = 2 * s->exposures * s->states * s->cells, numbers = waves + s->states;
-        if (s->gradient) memset(parts, 0, s->depths * numbers * sizeof(REAL));
+        if (s->gradient) memset(w->parts, 0, s->depths * numbers * sizeof(REAL));
 #pragma omp parallel for schedule(dynamic, 1) num_threads(s->threads)
         for (int64_t depth = 0; depth < s->depths; depth++) {
-            REAL *own = s->gradient ? parts + depth * numbers : 0;
-            compute(w, place, depth, own, s->gradient ? own + waves : 0);
+            REAL *own = s->gradient ? w->parts + depth * numbers : 0;
+            compute(w, place, depth, desks + thread_number(), own, s->gradient ? own + waves : 0);
         }
         for (int64_t depth = 0; depth < s->depths && s->gradient; depth++) {
-            const REAL *own = parts + depth * numbers;
+            const REAL *own = w->parts + depth * numbers;
             for (int64_t n = 0; n < waves; n++) s->of_waves[n] += own[n];
             for (int64_t k = 0; k < s->states; k++) s->of_weights[k] += own[waves + k];
         }
     }
-    free(w->row_weights), free(w->column_weights), free(w->desks);
-    return status;
+    free_all(&p);
+    return p.missing ? NO_MEMORY : 0;
 }
 
 // The light, or with a gradient of it those of waves and weights. Returns 0, NO_MEMORY, or REFUSED where points lie beyond
 // the grid.
 int scattered_light(const scattered *s) {
-    const int64_t most = s->extent / 4 + 1, quarter = s->quarter;  // even or odd rows
-    const int64_t rows = 4 * (matrix_size(quarter, most) + matrix_size(most, quarter)),
-                  pixels = 2 * s->exposures * s->shifts * (matrix_size(s->window, s->samples) + matrix_size(s->samples, s->window));
-    work own = {.s = s, .along = (quarter + LANES - 1) / LANES, .upright = (most + LANES - 1) / LANES}, *w = &own;
-    char *matrices = malloc(rows + pixels), *rest = matrices;
-    vec *tables = aligned_alloc(sizeof(vec), 4 * (2 * quarter * most / LANES + 1 + most * w->along + quarter * w->upright) * sizeof(vec)),
-        *beyond = tables;
-    w->start = malloc(2 * s->patches * sizeof(int64_t) + 1);
-    w->pixels = malloc(4 * s->exposures * s->shifts * sizeof(matrix) + 1);
-    REAL *parts = s->gradient ? malloc(s->depths * s->states * (2 * s->exposures * s->cells + 1) * sizeof(REAL) + 1) : 0;
-    int status = matrices && tables && w->start && w->pixels && (parts || !s->gradient) ? 0 : NO_MEMORY;
-    if (!status) {
-        lay_out_axes(s, s->cosines, w->along, w->upright, &w->cosines, &rest, &beyond);
-        lay_out_axes(s, s->sines, w->along, w->upright, &w->sines, &rest, &beyond);
-        for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(w, place, rest, parts);
-    }
-    free(matrices), free(tables), free(w->start), free(w->pixels), free(parts);
+    const int64_t along = (s->quarter + LANES - 1) / LANES, upright = (s->extent / 4 + LANES) / LANES;
+    pool p = {0};
+    work w = {.s = s, .along = along, .upright = upright, .cosines = lay_out_axes(&p, s, s->cosines, along, upright),
+              .sines = lay_out_axes(&p, s, s->sines, along, upright)};
+    w.start = take(&p, 2 * s->patches, sizeof(int64_t));
+    w.parts = take(&p, s->gradient ? s->depths * s->states * (2 * s->exposures * s->cells + 1) : 0, sizeof(REAL));
+    int status = p.missing ? NO_MEMORY : 0;
+    for (int64_t place = 0; place < s->places && !status; place++) status = compute_place(&w, place);
+    free_all(&p);
     return status;
 }
