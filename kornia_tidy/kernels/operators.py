@@ -156,12 +156,11 @@ def check(sizes: dict[str, int], dtype: torch.dtype | None, **tensors: tuple[Ten
             continue
         if dtype not in {None, tensor.dtype}:
             raise TypeError(f"{name} must be {dtype}, got {tensor.dtype}")
-        names = axes.split()
-        sizes |= {axis: int(axis) for axis in names if axis.isdigit()}
-        wanted = [sizes.get(axis, axis) for axis in names]
-        pairs = zip(names, tensor.shape, strict=False)
-        if tensor.ndim != len(names) or any(sizes.setdefault(axis, n) != n for axis, n in pairs):
-            raise ValueError(f"{name} must have shape ({', '.join(map(str, wanted))}), got {tuple(tensor.shape)}")
+        names, known = axes.split(), sizes.copy()
+        found = zip(names, tensor.shape, strict=False)
+        if tensor.ndim != len(names) or any(sizes.setdefault(x, int(x) if x.isdigit() else n) != n for x, n in found):
+            wanted = ", ".join(str(known.get(axis, axis)) for axis in names)
+            raise ValueError(f"{name} must have shape ({wanted}), got {tuple(tensor.shape)}")
 
 
 def strided(tensor: Tensor | None, axes: int = 4) -> tuple[Any, ...]:
@@ -190,9 +189,9 @@ def call(function: Any, *fields: Tensor | float | tuple[Any, ...] | None) -> int
     """
     kept: list[Any] = []
     for x in fields:
-        kept += x if isinstance(x, tuple) else [x.contiguous() if isinstance(x, Tensor) else x]
-    words = [x.data_ptr() if isinstance(x, Tensor) else x or 0 for x in kept]
-    kinds = "".join("d" if isinstance(x, float) else "q" for x in words)
+        kept += x if isinstance(x, tuple) else [x.contiguous()] if isinstance(x, Tensor) else [x or 0]
+    words = [x.data_ptr() if hasattr(x, "data_ptr") else x or 0 for x in kept]
+    kinds = "".join(["d" if type(x) is float else "q" for x in words])
     status = function(ctypes.c_char_p(struct.pack(f"q{kinds}", torch.get_num_threads(), *words)))
     if status == NO_MEMORY:
         shapes = ", ".join(str(tuple(x.shape)) for x in kept if isinstance(x, Tensor))
