@@ -113,10 +113,6 @@ def single_element(system: System, spectrum: Spectrum | None = None) -> Lens:
 _THICKNESS, _FIELD = 3e-3, 5e-3  # m, both assumed
 
 
-def _pixelwise(count: int) -> Callable[[torch.Generator | None], PhaseMasks]:
-    return lambda generator: PixelwiseMask(count, generator=generator)
-
-
 def _ikoma_masks(generator: torch.Generator | None) -> PhaseMasks:
     """Return a radial mask with a smooth random profile: noise at 13 radii, linear between them."""
     knots = 2.05 * torch.randn(1, 1, 13, generator=generator, dtype=torch.float32)
@@ -178,8 +174,8 @@ CUBIC = 27.0
 """Strength of the initial cubic mask of Sitzmann's system, in radians at the pupil's edge."""
 
 MASKS: dict[str, Callable[[torch.Generator | None], PhaseMasks]] = {
-    "tidy-5": _pixelwise(5),
-    "tidy-1": _pixelwise(1),
+    "tidy-5": lambda generator: PixelwiseMask(5, generator=generator),
+    "tidy-1": lambda generator: PixelwiseMask(1, generator=generator),
     "fresnel": lambda _: FresnelLens(),
     "phasecam3d": lambda _: ZernikeMask(1, 23, 55, initial=torch.tensor(FISHER_ZERNIKES)),
     "ikoma2021": _ikoma_masks,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_values
 from kornia_tidy.masks.limits import clamped
+from kornia_tidy.optics.aperture import check_aperture
 
 
 class LearnableAperture(nn.Module):
@@ -40,16 +40,8 @@ class LearnableAperture(nn.Module):
         if not isinstance(amplitude, nn.Parameter) or not amplitude.is_floating_point():
             found = amplitude.dtype if isinstance(amplitude, nn.Parameter) else type(amplitude).__name__
             raise TypeError(f"a learnable aperture must be an nn.Parameter of real floating-point numbers, got {found}")
-        shape = tuple(amplitude.shape)
-        if len(shape) not in (2, 3) or shape[-1] != shape[-2] or 0 in shape:
-            raise ValueError(f"a learnable aperture must have shape (N, N), or (K, N, N) for K masks, got {shape}")
-        check_values("aperture", amplitude)
-        own = amplitude.detach()
-        valid = (own >= 0) & (own <= 1)  # False for NaN too
-        if not bool(valid.all()):
-            raise ValueError(f"aperture must have amplitudes in [0, 1], got {own[~valid][0].item()}")
+        check_aperture(amplitude.detach(), amplitude.shape[-1] if amplitude.ndim else 1)
         self.amplitude = amplitude
-        check_open(own)
 
     def forward(self) -> Tensor:
         """Return the amplitude, clamped to [0, 1]."""

@@ -91,7 +91,6 @@ def _through_lens(optics: Any, scene: PlannedScene, size: tuple[int, int], toler
         operations=work.operations,
         reference_operations=scene.work_over_field(plan.reference, field).operations,
         memory_bytes=work.memory,
-        predicted_error=plan.predicted_error + error,
         error_parts=(*plan.error_parts, ("PSFs between places of the field", error)),
         field=field.nodes,
     )
@@ -107,7 +106,6 @@ def _measured(optics: Any, defocus: Tensor, images: tuple[int, int], tolerance: 
         fidelity=fidelity,
         reference=fidelity.replace(name="measured PSFs"),
         tolerance=tolerance,
-        predicted_error=0.0,
         error_parts=(),
         operations=work.operations,
         reference_operations=work.operations,

@@ -321,7 +321,6 @@ class PlannedScene:
             fidelity=fidelity,
             reference=self.reference,
             tolerance=tolerance,
-            predicted_error=self.error(fidelity),
             error_parts=tuple(self._parts(fidelity)),
             operations=self.operations(fidelity),
             reference_operations=self.operations(self.reference),

@@ -15,9 +15,7 @@ class RenderPlan:
         fidelity: the settings, for ``optics.with_fidelity(plan.fidelity)``. The window is fixed, but for rays.
         reference: of the error: the preset ``reference``, with the window of the current masks.
         tolerance: largest error allowed.
-        predicted_error: root mean square difference of the noise-free linear capture to ``reference``, full scale 1:
-            an upper estimate, see :mod:`kornia_tidy.accuracy.planning.planner` for its assumptions.
-        error_parts: contributions to ``predicted_error``, by the name of the approximation.
+        error_parts: contributions to :attr:`predicted_error`, by the name of the approximation.
         operations: of one capture with its PSFs, those of float64 counted twice.
         reference_operations: those of the reference.
         memory_bytes: peak of one capture without gradients, beyond the image.
@@ -32,7 +30,6 @@ class RenderPlan:
     fidelity: Fidelity
     reference: Fidelity
     tolerance: float
-    predicted_error: float
     error_parts: tuple[tuple[str, float], ...]
     operations: float
     reference_operations: float
@@ -43,6 +40,14 @@ class RenderPlan:
     states: int = 1
     field: tuple[int, int] = (1, 1)
     left_out: str = ""
+
+    @property
+    def predicted_error(self) -> float:
+        """Root mean square difference of the noise-free linear capture to ``reference``, full scale 1.
+
+        It is an upper estimate, see :mod:`kornia_tidy.accuracy.planning.planner` for its assumptions.
+        """
+        return sum(error for _, error in self.error_parts)
 
     def __str__(self) -> str:
         """Describe the computation, its approximations and its cost in words."""
