@@ -88,7 +88,7 @@ class Field:
         r"""Return the tiles along an axis of a part of the picture: as large as possible, and alike in any part.
 
         A tile of n pixels takes for its middle :math:`h + h'' (n^2 - 1) / 24`, so that its first order is right on
-        average.
+        average. Slopes are zero in tiles in which PSFs may be taken as in the middle.
 
         Args:
             axis: 0 for rows, 1 for columns.
@@ -113,7 +113,7 @@ class Field:
         middles = starts.double() + (side - 1) / 2
         edges = torch.cat([(starts - first).clamp(min=0), torch.tensor([pixels])])
         weights, slopes, bends = self.along(axis, middles)
-        return edges, middles - first, torch.stack([weights + bends * (side**2 - 1) / 24, slopes], 1)
+        return edges, middles - first, torch.stack([weights + bends * (side**2 - 1) / 24, slopes * (side > self.still)], 1)
 
 
 def check_center(center: Any) -> tuple[float, float]:

@@ -117,8 +117,7 @@ class LayeredScene:
     def places(self) -> Places:
         """Tiles over the field and the nodes' weights there: at the pixels that see, for scatter at those of the light.
 
-        Tiles are as large as suits the PSFs, but not larger than the field's cells. Those of occlusion are small, and
-        without gradients along an axis where PSFs hardly change in them.
+        Tiles are as large as suits the PSFs, but not larger than the field's cells. Those of occlusion are small.
         """
         assert self.field is not None
         side, origin, occludes = self.psfs.shape[-1], self.field.origin, self.compositing == "occlusion"
@@ -127,11 +126,7 @@ class LayeredScene:
         moved = side // 2 * (valid - scatters)
         most = TILE if occludes else (min(self.field.cell, window_size(side) - side + 1),) * 2
         rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond) for i in (0, 1))
-        places = Places(*rows, *columns)
-        if occludes:
-            for weights, pixels in ((places.row_weights, TILE[0]), (places.column_weights, TILE[1])):
-                weights[:, 1] *= pixels > self.field.still
-        return places
+        return Places(*rows, *columns)
 
     @cached_property
     def sampled_layers(self) -> int:

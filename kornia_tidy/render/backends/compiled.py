@@ -36,7 +36,6 @@ NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 # layer to multiply by a spectrum and to add up.
 _TILE, _PAIR = 100, 14
 _WINDOW = 1e5  # for each window beside those of its samples: the extra time of small ones
-_TERMS = 3  # of a PSF over the field: its value and two gradients
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
 
 
@@ -91,19 +90,20 @@ class CompiledBackend:
         """Return the work: of occlusion as the C code counts it, of windows with the layers in a sample of pixels."""
         labels, (batch, channels), side = scene.labels, scene.image.shape[:2], scene.psfs.shape[-1]
         pixels, itemsize = batch * scene.output_size[0] * scene.output_size[1], scene.image.element_size()
-        image, words = channels * labels.layer_index.numel() * itemsize, channels * itemsize // 4
+        image, words, terms = channels * labels.layer_index.numel() * itemsize, channels * itemsize // 4, 1
+        if scene.field is not None:  # a tile's PSF has its value and as many as two gradients
+            terms += sum(bool(x[:, 1].any()) for x in (scene.places.row_weights, scene.places.column_weights))
         if scene.compositing == "occlusion":
             one = scene.psfs if scene.field is None else scene.psfs[0]
             operations, tables = words * occlusion_ops.count_operations(*scene.sorted_layers, one, batch), 0
-            if scene.field is not None:  # each block makes its PSFs, and may blur by the value and two gradients
-                moving = sum(bool(x[:, 1].any()) for x in (scene.places.row_weights, scene.places.column_weights))
-                operations *= 1.5 * (1 + moving)
+            if scene.field is not None:  # each block makes its PSFs
+                operations *= 1.5 * terms
                 tables = 2 * one.numel() * scene.field.nodes[1] * itemsize * torch.get_num_threads()
             return Work(operations, 2 * image + 32 * labels.layer_index.numel() + tables)
         kept = 16 * labels.layer_index.numel()
-        if terms := _Sums(scene).terms:
+        if direct := _Sums(scene).terms:
             blended = 1 if labels.layer_weight is None else 2
-            return Work(2 * blended * words * pixels * terms, 2 * image + kept)
+            return Work(2 * blended * words * pixels * direct, 2 * image + kept)
         height, width = labels.layer_index.shape[1:]
         sides, threads = (window_size(side), window_size(side)), torch.get_num_threads()
         if scene.field is not None:
@@ -116,10 +116,10 @@ class CompiledBackend:
         transforms, planes, sums = blocks + pairs + layers, layers + _WINDOW_PLANES * threads, 0
         if scene.field is not None:  # light in each tile, PSFs in each pair, and x and y times both
             down, across = scene.field.nodes
-            transforms, planes = _TERMS * blocks + (_TERMS + 1) * pairs, (_WINDOW_PLANES + 2 * _TERMS) * threads
-            sums = _TERMS * 2 * side**2 * across * (pairs + 2 * down * layers * rows)
+            transforms, planes = terms * blocks + (terms + 1) * pairs, (_WINDOW_PLANES + 2 * terms) * threads
+            sums = terms * 2 * side**2 * across * (pairs + 2 * down * layers * rows)
             kept += 2 * across * layers * side**2 * itemsize * threads
-            pairs *= _TERMS
+            pairs *= terms
         operations = transform_operations(*sides) * transforms + _WINDOW * blocks + sums
         operations = words * (operations + samples * (_TILE * blocks + _PAIR * pairs))
         return Work(operations, planes * itemsize * samples + 3 * image + kept, max(sides))
