@@ -37,6 +37,7 @@ NEGATIVE = 1e-4  # of a PSF: over EPSILON it makes a float32's round-off 1e-5
 _TILE, _PAIR = 100, 14
 _WINDOW = 1e5  # for each window beside those of its samples: the extra time of small ones
 _WINDOW_PLANES = 7  # of a thread: light, labels, weights and sums of a window, two spectra, and one on its way back
+_OF_FIELD = 6  # the same over the field: spectra of a PSF and of light, each with two gradients
 
 
 class CompiledBackend:
@@ -116,7 +117,7 @@ class CompiledBackend:
         transforms, planes, sums = blocks + pairs + layers, layers + _WINDOW_PLANES * threads, 0
         if scene.field is not None:  # light in each tile, PSFs in each pair, and x and y times both
             down, across = scene.field.nodes
-            transforms, planes = terms * blocks + (terms + 1) * pairs, (_WINDOW_PLANES + 2 * terms) * threads
+            transforms, planes = terms * blocks + (terms + 1) * pairs, (_WINDOW_PLANES + _OF_FIELD) * threads
             sums = terms * 2 * side**2 * across * (pairs + 2 * down * layers * rows)
             kept += 2 * across * layers * side**2 * itemsize * threads
             pairs *= terms
