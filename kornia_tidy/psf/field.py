@@ -113,7 +113,8 @@ class Field:
         middles = starts.double() + (side - 1) / 2
         edges = torch.cat([(starts - first).clamp(min=0), torch.tensor([pixels])])
         weights, slopes, bends = self.along(axis, middles)
-        return edges, middles - first, torch.stack([weights + bends * (side**2 - 1) / 24, slopes * (side > self.still)], 1)
+        orders = weights + bends * (side**2 - 1) / 24, slopes * (side > self.still)
+        return edges, middles - first, torch.stack(orders, 1)
 
 
 def check_center(center: Any) -> tuple[float, float]:
