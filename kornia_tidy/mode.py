@@ -123,3 +123,12 @@ def recording_in_operator() -> Generator[None]:
 def refuse_torchscript() -> NoReturn:
     """Raise the error of TorchScript compilation, which names the alternatives."""
     raise NotImplementedError(TORCHSCRIPT)
+
+
+def refuse_onnx() -> None:
+    """Raise ``NotImplementedError`` in an export to ONNX, which has no operators of cameras."""
+    if torch.onnx.is_in_onnx_export():
+        raise NotImplementedError(
+            "a programmable camera cannot become ONNX, which has no rendering by depth: export it with "
+            "torch.export.export(optics, (image, depth)), and networks for its captures by torch.onnx.export"
+        )

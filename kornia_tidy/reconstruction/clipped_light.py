@@ -53,7 +53,7 @@ def beyond_full_scale(light: Tensor, noise: Tensor | float) -> Tensor:
     by_place = AMONG * far**3 - COLORS * far * known.sum(1, keepdim=True) + LEVEL
     sure = (sum_short + LEAST) / (sum_short + DOUBT * noise * (1 - around) + LEAST)
     excess = sure * (by_border + by_place)
-    return torch.where(clipped, 1 + excess.clamp(0, MOST), light)
+    return torch.where(clipped, 1 + excess.clamp(0.0, MOST), light)  # ends of one type for ONNX
 
 
 def clipped_share(capture: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from kornia_tidy.data.scene_statistics import PHOTOGRAPHS
+from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.clipped_light import CLIPPED, beyond_full_scale
 from kornia_tidy.reconstruction.closed_form import (
@@ -218,13 +219,20 @@ class RuledClosedForm(ClosedForm):
         """
         if self.sample is None:
             return self._settings(list(zip(sampled_windows(light), sampled_windows(noise), strict=True)))
-        told = None if self._is_of_sensor(light, noise) else float(noise.square().nan_to_num().mean().sqrt())
+        of_sensor, even = self._is_of_sensor(light, noise), noise.square().nan_to_num().mean().sqrt()
+        if Mode.GRAPH in torch_mode():
+            return self._settings_of_sample(light, of_sensor, even)
+        told = None if bool(of_sensor) else float(even)
         if told not in self.remembered:
-            windows = [part.to(light) for part in self.sample]
-            levels = [self._noise_of(part) if told is None else torch.full_like(part, told) for part in windows]
-            without = [self._without_stray_light(part) for part in windows]
-            self.remembered[told] = self._settings(list(zip(without, levels, strict=True)))
+            self.remembered[told] = self._settings_of_sample(light, of_sensor, even)
         return self.remembered[told]
+
+    def _settings_of_sample(self, light: Tensor, of_sensor: Tensor, even: Tensor) -> Settings:
+        """Return the settings from the sample of a picture, with the noise of the sensor or another that is even."""
+        windows = [part.to(light) for part in self.sample or ()]
+        levels = [torch.where(of_sensor, self._noise_of(part), even) for part in windows]
+        without = [self._without_stray_light(part) for part in windows]
+        return self._settings(list(zip(without, levels, strict=True)))
 
     def _settings(self, windows: list[tuple[Tensor, Tensor]]) -> Settings:
         """Return the settings from windows of light and of its noise."""
@@ -241,10 +249,10 @@ class RuledClosedForm(ClosedForm):
         ratio = (power / slope.clamp(min=torch.finfo(slope.dtype).tiny))[:, None, None, None]
         return Settings(even, place, self._color_of_least_risk(windows, place), ratio)
 
-    def _is_of_sensor(self, light: Tensor, noise: Tensor) -> bool:
+    def _is_of_sensor(self, light: Tensor, noise: Tensor) -> Tensor:
         """Return whether the noise of a tile without stray light is that of the sensor, and no other that was told."""
         seen = light + self._stray_light(light) if self.has_stray_light else light
-        return bool(((self._noise_of(seen.clamp(0, 1)) - noise).abs() <= 1e-3 * noise).float().mean() > 0.5)
+        return ((self._noise_of(seen.clamp(0, 1)) - noise).abs() <= 1e-3 * noise).float().mean() > 0.5
 
     def _facts(self, light: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return detail and variance of noise of the encoded light, and the mean squared slope of the code, (B,)."""

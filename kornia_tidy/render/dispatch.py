@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.checks import check_choice
 from kornia_tidy.kernels.recomputed_ops import define_recomputed
-from kornia_tidy.mode import Mode, torch_mode
+from kornia_tidy.mode import Mode, refuse_onnx, torch_mode
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.backend import Backend, GradientPairs, Work, wants_gradient
 from kornia_tidy.render.backends.batched import BatchedBackend
@@ -214,6 +214,7 @@ def _rendered(*arguments: Any) -> Tensor:
 
 
 def _render_fake(*arguments: Any) -> Tensor:
+    refuse_onnx()
     image, psfs, border = arguments[0], arguments[3], arguments[7]
     lost = psfs.shape[-1] - 1 if border == "valid" else 0
     return image.new_empty(image.shape[0], image.shape[1], image.shape[2] - lost, image.shape[3] - lost)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 
 import pytest
 import torch
@@ -256,6 +257,14 @@ class TestTracing(BaseTester):
 
         with pytest.raises(NotImplementedError, match="cannot become TorchScript"):
             torch.jit.trace(PSFs(), torch.ones(()))
+
+    @pytest.mark.takes_seconds
+    def test_exception_onnx_is_refused_in_a_sentence(self):
+        with (
+            warnings.catch_warnings(action="ignore"),
+            pytest.raises(Exception, match=r"cannot become ONNX, .* torch\.exp"),
+        ):
+            torch.onnx.export(camera(), scene(), dynamo=True, verbose=False)
 
     @pytest.mark.slow
     def test_feature_export_gives_the_same_capture(self):

@@ -9,6 +9,7 @@ from kornia.filters import gaussian_blur2d
 from kornia_tidy import PSFBank
 from kornia_tidy.reconstruction import RuledClosedForm, ruled_closed_form
 from kornia_tidy.reconstruction.clipped_light import MOST, beyond_full_scale
+from tests.reconstruction.onnx_export import check_onnx
 
 NOISE = 0.004
 
@@ -82,3 +83,13 @@ def test_a_picture_under_vmap_is_restored_as_one_of_a_batch() -> None:
     light = blurred(torch.cat([blob(2.5), blob(0.9)])).clamp(max=1)
     found = torch.vmap(lambda one: beyond_full_scale(one[None], NOISE)[0])(light)
     torch.testing.assert_close(found, beyond_full_scale(light, NOISE))
+
+
+class Beyond(torch.nn.Module):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return beyond_full_scale(image, NOISE)
+
+
+@pytest.mark.takes_seconds
+def test_onnx_computes_the_same() -> None:
+    check_onnx(Beyond(), blurred(blob(2.5, 24)).clamp(max=1), blurred(blob(1.6, 24)).clamp(max=1))

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from kornia.filters import gaussian_blur2d
+from torch._subclasses import FakeTensorMode
 
 from kornia_tidy import PSFBank, SensorNoise
 from kornia_tidy.data import PHOTOGRAPHS
@@ -25,6 +26,7 @@ from kornia_tidy.reconstruction.ruled_closed_form import (
     band_facts,
     light_detail,
 )
+from kornia_tidy.reconstruction.whole_picture import whole_picture
 from tests.base import BaseTester
 from tests.reconstruction.test_closed_form import bank, photo
 
@@ -212,6 +214,21 @@ class TestRuledClosedForm(BaseTester):
             whole, tiled = head(capture), reconstruct_tiled(head, capture, tile=(48, 160))
         self.assert_close(tiled, whole, atol=2e-3, rtol=0)
         assert (tiled - whole).abs().mean() < 2e-5
+
+    @pytest.mark.parametrize("told", [False, True])
+    def test_dynamo_settings_of_a_tile_in_a_graph_are_those_of_eager_runs(self, told, monkeypatch):
+        """Eager runs tell a sensor's noise from another by its values, and a graph has none."""
+        restore, light = ruled(), photo(24, 24)
+        restore.set_noise(SensorNoise(0.003, full_well=500.0))
+        tile = light[..., :16, :20]
+        noise = torch.full_like(tile, 0.02) if told else restore._noise_of(tile)
+        with whole_picture(restore, light):
+            eager = restore.settings(tile, noise)
+            monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+            for found, expected in zip(restore.settings(tile, noise), eager, strict=True):
+                self.assert_close(found, expected)
+            with FakeTensorMode(allow_non_fake_inputs=True):  # refuses to show values
+                restore.settings(tile, noise)
 
     def test_feature_clipped_pixels_are_told(self):
         capture = photo(16, 16)
