@@ -233,7 +233,10 @@ def target_vector_bytes(compiler: Compiler) -> int:
 
 
 def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
-    """Compile and install a library in one step, under a name with the digests of its inputs and of its content."""
+    """Compile and install a library in one step, under a name with the digests of its inputs and of its content.
+
+    One that a crash of the system leaves incomplete does not match its name, and is built again.
+    """
     with tempfile.TemporaryDirectory(dir=folder) as own:
         new = Path(own) / "library.so"
         try:
@@ -243,16 +246,8 @@ def _compile(source: Path, folder: Path, name: str, command: list[str]) -> Path:
                 raise
             raise FileNotFoundError(f"the cache was removed while it was compiled: {error}") from None
         new.chmod(0o700)
-        with new.open("rb") as file:
-            os.fsync(file.fileno())
         path = folder / f"{name}-{_content_digest(new)}.so"
         new.replace(path)
-    with suppress(OSError):  # not every system has folders that can be synchronised
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
     return path
 
 

@@ -183,7 +183,7 @@ def _backward(ctx: Any, gradient: Tensor, by_operator: Callable[..., Tensor], by
 
 @operator(lambda *given: _backward(*given, _srgb, _convert_by_torch), _keep)
 def _srgb(image: Tensor, encode: bool, gradient: Tensor | None = None) -> Iterator[Tensor]:
-    return _fill("convert", image, gradient, (), encode)
+    return _fill("encode" if encode else "decode", image, gradient)
 
 
 @operator(lambda *given: _backward(*given, _record, _record_by_torch), _keep)
@@ -199,11 +199,15 @@ def _record(
     clip: bool,
     gradient: Tensor | None = None,
 ) -> Iterator[Tensor]:
-    return _fill("record", light, gradient, (shot, read, offset), full_well, dark, sigma, 2**bits - 1, clip)
+    return _fill("record", light, gradient, (shot, read, offset), (full_well, dark, sigma, 2**bits - 1, clip))
 
 
 def _fill(
-    function: str, x: Tensor, gradient: Tensor | None, fields: Sequence[Tensor | None], *numbers: float
+    function: str,
+    x: Tensor,
+    gradient: Tensor | None,
+    fields: Sequence[Tensor | None] = (None,) * 3,
+    numbers: Sequence[float] = (0,) * 5,
 ) -> Iterator[Tensor]:
     """Yield memory like that of ``x``, and fill it by a function of pixels.c; with a gradient, by its product."""
     given = x, gradient, *fields

@@ -22,10 +22,15 @@ typedef double wide __attribute__((vector_size(VECTOR_BYTES)));
 typedef REAL narrow __attribute__((vector_size(WIDE * sizeof(REAL)), may_alias));
 typedef int64_t wide_bits __attribute__((vector_size(VECTOR_BYTES)));
 
+// The fields of `_fill` in pixel_ops.py. All tensors but `x` and `out` may be null.
 typedef struct {
-    REAL full_well, dark, sigma, top;  // top: of the converter's levels, 0 for none
-    int clip;
-} sensor;
+    int64_t threads;
+    const REAL *x, *gradient, *shot, *read, *offset;
+    REAL *out;
+    int64_t count;
+    double full_well, dark, sigma;
+    int64_t top, clip;  // top: of the converter's levels, 0 for none
+} pixels;
 
 static const REAL CENTRE[] = {2.12331348,     0.348802028,     -0.00590772566, -0.00177162265, 0.000308792663,
                               -7.03206336e-06, -4.89881495e-06, 6.62037701e-07, 3.30020413e-08, -1.26316508e-08};
@@ -130,12 +135,13 @@ INLINE vec counted(vec rate, vec u) {
     return counts;
 }
 
-// Records light x or, with `slope`, computes the derivative.
-INLINE vec recorded(vec x, const REAL *shot, const REAL *read, const REAL *offset, const sensor *s, int slope) {
+// Records light x or, with `slope`, computes the derivative: of the n-th pixel, and so many more.
+INLINE vec recorded(vec x, const pixels *s, int64_t n, int64_t count, int slope) {
+    const REAL full_well = s->full_well, dark = s->dark, sigma = s->sigma, top = s->top;
     vec derivative = all(1);
-    if (shot) {
-        vec u = *(const loose *)shot, zero = all(0), threshold = all(25), light = choose(x < 0, zero, x);
-        vec rate = rounded(light * s->full_well) + s->dark, electrons = zero, slope_of = all(1);
+    if (s->shot) {
+        vec u = load_some(s->shot + n, count), zero = all(0), threshold = all(25), light = choose(x < 0, zero, x);
+        vec rate = rounded(light * full_well) + dark, electrons = zero, slope_of = all(1);
         bits dim = rate < threshold, others = ~dim;
         if (any(&dim)) electrons = counted(choose(dim, rate, zero), u);
         if (any(&others)) {
@@ -146,67 +152,24 @@ INLINE vec recorded(vec x, const REAL *shot, const REAL *read, const REAL *offse
         }
         if (slope) derivative = choose(x >= 0, slope_of, zero);
         if (s->clip) {
-            vec well = all(s->full_well);
+            vec well = all(full_well);
             if (slope) derivative = choose(electrons <= well, derivative, zero);
             electrons = choose(electrons > well, well, electrons);
         }
-        x = (electrons - s->dark) / s->full_well;
+        x = (electrons - dark) / full_well;
     }
-    if (read) x += rounded(s->sigma * *(const loose *)read);
-    if (offset) x += *(const loose *)offset;
-    if (s->top > 0) {
+    if (s->read) x += rounded(sigma * load_some(s->read + n, count));
+    if (s->offset) x += load_some(s->offset + n, count);
+    if (top > 0) {
         const vec whole = all(SINGLE ? 0x1p23 : 0x1p52);  // larger numbers are whole
-        vec level = rounded(x * s->top), size = choose(level < 0, -level, level);
+        vec level = rounded(x * top), size = choose(level < 0, -level, level);
         vec nearest = rounded(size + whole) - whole;
         level = choose(size < whole, choose(level < 0, -nearest, nearest), level);
-        x = level / s->top;
+        x = level / top;
     }
     if (!s->clip) return slope ? derivative : x;
     if (slope) return choose((x >= 0) & (x <= 1), derivative, all(0));
     return bounded(x, all(0), all(1));
-}
-
-INLINE const REAL *at(const REAL *field, int64_t n) { return field ? field + n : 0; }
-
-// A vector of a field whose last `count` numbers are left; zeros behind them.
-INLINE const REAL *padded(const REAL *field, int64_t count, REAL *own) {
-    if (!field) return 0;
-    memset(own, 0, LANES * sizeof(REAL));
-    memcpy(own, field, count * sizeof(REAL));
-    return own;
-}
-
-// The fields of `_record` in pixel_ops.py.
-typedef struct {
-    int64_t threads;
-    const REAL *x, *gradient, *shot, *read, *offset;  // all but `x` may be null
-    REAL *out;
-    int64_t count;
-    double full_well, dark, sigma;
-    int64_t top, clip;
-} recording;
-
-// Records `count` numbers; with a gradient, multiplies it by the derivative instead.
-int record(const recording *r) {
-    const sensor s = {r->full_well, r->dark, r->sigma, r->top, r->clip};
-    const REAL *x = r->x, *gradient = r->gradient, *shot = r->shot, *read = r->read, *offset = r->offset;
-    REAL *out = r->out;
-#pragma omp parallel for num_threads(r->threads) if (r->count > 8 * BLOCK)
-    for (int64_t first = 0; first < r->count; first += BLOCK) {
-        const int64_t end = first + least(BLOCK, r->count - first);
-        int64_t n = first;
-        for (; n + LANES <= end; n += LANES) {
-            vec made = recorded(*(const loose *)(x + n), at(shot, n), at(read, n), at(offset, n), &s, gradient != 0);
-            *(loose *)(out + n) = gradient ? made * *(const loose *)(gradient + n) : made;
-        }
-        if (n == end) continue;
-        REAL own[4][LANES];
-        vec last = *(const loose *)padded(x + n, end - n, own[0]);
-        last = recorded(last, padded(at(shot, n), end - n, own[1]), padded(at(read, n), end - n, own[2]),
-                        padded(at(offset, n), end - n, own[3]), &s, gradient != 0);
-        for (int64_t i = 0; n + i < end; i++) out[n + i] = gradient ? last[i] * gradient[n + i] : last[i];
-    }
-    return 0;
 }
 
 // log2(1.5 + x) and exp2(x) for |x| <= 1/2, through Chebyshev's points.
@@ -224,7 +187,7 @@ INLINE vec rough_power(vec x, REAL power) {
 }
 
 // Computes the decoding of sRGB or, with `slope`, its derivative.
-INLINE vec decode(vec x, int slope) {
+INLINE vec decoded(vec x, int slope) {
     const double scale = 1 / 1.055;
     const REAL high = scale, low = scale - high, linear = 12.92, joint = 0.04045;
     const vec most = all(SINGLE ? 0x1p100 : 0x1p850);  // what is below overflows for more, and no sooner
@@ -240,7 +203,7 @@ INLINE vec decode(vec x, int slope) {
 }
 
 // Computes the encoding of sRGB or, with `slope`, its derivative.
-INLINE vec encode(vec x, int slope) {
+INLINE vec encoded(vec x, int slope) {
     const REAL high = 1.055, low = 1.055 - high, linear = 12.92, joint = 0.0031308;
     const vec most = all(SINGLE ? FLT_MAX : DBL_MAX);
     vec bounded = choose(x < most, x, most), u = rough_power(bounded, (REAL)(-7. / 12)), root, correction;
@@ -255,38 +218,32 @@ INLINE vec encode(vec x, int slope) {
     return choose(x > joint, root * high + rest, linear * x);
 }
 
-INLINE vec curve(vec x, int encoding, int slope) { return encoding ? encode(x, slope) : decode(x, slope); }
+enum { DECODE, ENCODE, RECORD };
 
-INLINE void convert_block(const REAL *x, const REAL *gradient, REAL *out, int64_t count, int encoding) {
-    int64_t n = 0;
-    for (; n + LANES <= count; n += LANES) {
-        vec made = curve(*(const loose *)(x + n), encoding, gradient != 0);
-        *(loose *)(out + n) = gradient ? made * *(const loose *)(gradient + n) : made;
-    }
-    vec last = {0};
-    if (n == count) return;
-    memcpy(&last, x + n, (count - n) * sizeof(REAL));
-    last = curve(last, encoding, gradient != 0);
-    for (int64_t i = 0; n + i < count; i++) out[n + i] = gradient ? last[i] * gradient[n + i] : last[i];
+// Computes the values of `count` pixels, a vector at most, or with `slope` the products of their gradient and the derivative.
+INLINE void compute_some(const pixels *p, int64_t n, int64_t count, int kind, int slope) {
+    vec x = load_some(p->x + n, count);
+    x = kind == RECORD ? recorded(x, p, n, count, slope) : kind == ENCODE ? encoded(x, slope) : decoded(x, slope);
+    if (slope) x *= load_some(p->gradient + n, count);
+    store_some(p->out + n, &x, count);
 }
 
-// The fields of `_srgb` in pixel_ops.py.
-typedef struct {
-    int64_t threads;
-    const REAL *x, *gradient;  // the second may be null
-    REAL *out;
-    int64_t count, encoding;
-} conversion;
+INLINE void compute_block(pixels p, int64_t n, int64_t end, int kind, int slope) {
+    for (; n + LANES <= end; n += LANES) compute_some(&p, n, LANES, kind, slope);
+    if (n < end) compute_some(&p, n, end - n, kind, slope);
+}
 
-// Decodes or encodes `count` numbers; with a gradient, multiplies it by the derivative instead.
-int convert(const conversion *c) {
-#pragma omp parallel for num_threads(c->threads) if (c->count > 8 * BLOCK)
-    for (int64_t n = 0; n < c->count; n += BLOCK) {
-        const int64_t size = least(BLOCK, c->count - n);
-        if (c->gradient && c->encoding) convert_block(c->x + n, c->gradient + n, c->out + n, size, 1);
-        else if (c->gradient) convert_block(c->x + n, c->gradient + n, c->out + n, size, 0);
-        else if (c->encoding) convert_block(c->x + n, 0, c->out + n, size, 1);
-        else convert_block(c->x + n, 0, c->out + n, size, 0);
+INLINE int compute(const pixels *p, int kind) {
+#pragma omp parallel for num_threads(p->threads) if (p->count > 8 * BLOCK)
+    for (int64_t n = 0; n < p->count; n += BLOCK) {
+        if (p->gradient) compute_block(*p, n, least(n + BLOCK, p->count), kind, 1);
+        else compute_block(*p, n, least(n + BLOCK, p->count), kind, 0);
     }
     return 0;
 }
+
+int decode(const pixels *p) { return compute(p, DECODE); }
+
+int encode(const pixels *p) { return compute(p, ENCODE); }
+
+int record(const pixels *p) { return compute(p, RECORD); }

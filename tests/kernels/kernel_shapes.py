@@ -496,7 +496,7 @@ def scattered_written_out(
 
 
 def srgb(draw: random.Random) -> Call:
-    """``convert`` of pixels.c: to 2e-7 in float32, and to 16 roundings of the value: the power raises some."""
+    """``decode`` and ``encode`` of pixels.c: to 2e-7 in float32, and to 16 roundings of the value."""
     image, encode, about = _colours(draw)
 
     def truth() -> tuple[Tensor, Tensor]:
@@ -508,7 +508,7 @@ def srgb(draw: random.Random) -> Call:
 
 
 def srgb_gradient(draw: random.Random) -> Call:
-    """``convert`` of pixels.c with a gradient: to 16 roundings of it."""
+    """``decode`` and ``encode`` of pixels.c with a gradient: to 16 roundings of it."""
     image, encode, about = _colours(draw)
     gradient = torch.randn_like(image)
 
