@@ -115,7 +115,7 @@ def to_spectrum(planes: Tensor, size: tuple[int, int]) -> Tensor:
     height, width = transform_side(size[0]), transform_side(size[1])
     if planes.device.type != "cpu":
         return torch.fft.rfft2(planes, s=(height, width))
-    return torch.fft.fft(torch.fft.rfft(planes, n=width).mT.contiguous(), n=height)
+    return torch.fft.fft(torch.fft.rfft(planes, n=width).mT, n=height)
 
 
 def from_spectrum(product: Tensor, size: tuple[int, int], psf_size: int) -> Tensor:
@@ -127,4 +127,4 @@ def from_spectrum(product: Tensor, size: tuple[int, int], psf_size: int) -> Tens
     rows, columns = slice(psf_size - 1, size[0]), slice(psf_size - 1, size[1])
     if product.device.type != "cpu":
         return torch.fft.irfft2(product, s=(height, width))[..., rows, columns]
-    return torch.fft.irfft(torch.fft.ifft(product)[..., rows].mT.contiguous(), n=width)[..., columns]
+    return torch.fft.irfft(torch.fft.ifft(product)[..., rows].mT, n=width)[..., columns]

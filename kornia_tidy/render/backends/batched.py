@@ -99,8 +99,7 @@ class BatchedBackend:
         if _is_whole(scene):
             return size
         if scene.image.device.type == "cpu":
-            windows = count(max(self.smallest, -(-5 * side // (2 * _STEP)) * _STEP), _STEP)
-            most = next(window for window in windows if transform_side(window) == window) - side + 1
+            most = next(n for k in count(6) for n in (2**k, 5 * 2 ** (k - 2)) if n >= max(2 * side, 64 if scene.compositing == "occlusion" else 128)) - side + 1
         else:
             planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
             most = max(size)
@@ -155,14 +154,14 @@ def _pixels(scene: LayeredScene) -> tuple[int, int]:
     return scene.padded_size if scene.compositing == "scatter" else scene.output_size
 
 
-def _held(scene: LayeredScene, images: slice, rows: slice, columns: slice, reach: int) -> Tensor:
+def _held(scene: LayeredScene, images: slice, rows: slice, columns: slice, reach: int) -> list[int]:
     """Return the layers around the pixels of a part, ascending."""
     index, weight = scene.sorted_layers
     window = Part(images, slice(None), rows, columns, None).window(index, reach)
     held = torch.bincount(window.flatten(), minlength=len(scene.psfs)) > 0
     if weight is not None:
         held[1:] |= held[:-1].clone()
-    return held.nonzero()[:, 0]
+    return held.nonzero()[:, 0].tolist()
 
 
 def _is_whole(scene: LayeredScene) -> bool:

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from kornia_tidy.render.borders import from_spectrum, to_spectrum
-from kornia_tidy.render.layers import weight_of_layer
+from kornia_tidy.render.borders import from_spectrum, to_spectrum, transform_side
 from kornia_tidy.render.scene import LayeredScene
 
 
@@ -26,14 +25,14 @@ class Part:
         channels: of the image.
         rows: of the pixels whose layers count, for occlusion of the output.
         columns: the same.
-        layers: (D',) those that it holds, ascending; None: all.
+        layers: those that it holds, ascending; None: all.
     """
 
     images: slice
     channels: slice
     rows: slice
     columns: slice
-    layers: Tensor | None
+    layers: list[int] | None
 
     def window(self, planes: Tensor, lost: int = 0) -> Tensor:
         """Return the part of planes (B or 1, ..., H, W), with as many rows and columns more as PSFs lose."""
@@ -86,24 +85,23 @@ class LayerBatches:
         return whole
 
     def _gathered(self, plane: Tensor, part: Part, correlate: bool, weight_gradient: bool) -> Tensor:
-        light, (index, weight) = part.window(plane[:, part.channels], self.side - 1), self._labels(part)
         size = self._size(self.side - 1)
-        psfs = self._psfs(part, size, correlate)
-        blurred = from_spectrum(to_spectrum(light, size)[:, None] * psfs, size, self.side)
-        places = index[:, None, None].expand(len(blurred), 1, light.shape[1], -1, -1)
-        below = blurred.gather(1, places)[:, 0]
-        if weight is None or len(psfs) == 1:
-            return below
-        above = blurred.gather(1, (places + 1).clamp_(max=len(psfs) - 1))[:, 0]
-        return above - below if weight_gradient else torch.lerp(below, above, weight[:, None])
+        light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size)
+        blurred = from_spectrum(self._times_psfs(light[:, None], part, size, correlate), size, self.side)
+        below, above, weight = self._labels(part, blurred)
+        found = blurred.gather(1, below)[:, 0]
+        if weight is None:
+            return found
+        other = blurred.gather(1, above)[:, 0]
+        return other - found if weight_gradient else torch.lerp(found, other, weight[:, 0])
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return the light that pixels scatter."""
         whole: Tensor | None = None
         for part in self.parts:
-            light, size = part.window(pixels[:, part.channels]), self._size(self.rim)
-            spectra = to_spectrum(self._own(light, part), size).mul_(self._psfs(part, size, correlate))
-            spread = from_spectrum(spectra.sum(1), size, 1)
+            size = self._size(self.rim)
+            own = self._own(pixels, part, size)
+            spread = from_spectrum(self._times_psfs(own, part, size, correlate).sum(1), size, 1)
             if len(self.parts) == 1:
                 return spread
             if whole is None:
@@ -117,35 +115,52 @@ class LayerBatches:
         """Return the gradient of the PSFs, (D, C, P, P)."""
         size, found = self._size(self.side - 1), None
         for part in self.parts:
-            light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size)
-            own = to_spectrum(self._own(part.window(pixels[:, part.channels]), part), size)
-            product = (own.conj() * light[:, None]).sum(0)
-            if part.layers is None and part.channels == slice(0, pixels.shape[1]):
-                found = product if found is None else found + product
-                continue
+            light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size).conj().resolve_conj()
+            own = self._own(pixels, part, size)
             if found is None:
-                found = product.new_zeros(*self.psfs.shape[:2], *product.shape[-2:])
-            found[slice(None) if part.layers is None else part.layers, part.channels] += product
+                found = own.new_zeros(*self.psfs.shape[:2], *own.shape[-2:])
+            if part.layers is None:
+                found[:, part.channels] += (own * light[:, None]).sum(0)
+                continue
+            for n, layer in enumerate(part.layers):
+                found[layer, part.channels].addcmul_(own[0, n], light[0])
         assert found is not None
-        total = from_spectrum(found, size, 1)[..., : self.side, : self.side]
+        total = from_spectrum(found.conj(), size, 1)[..., : self.side, : self.side]
         return total if correlate else total.flip((-2, -1))
 
     def _size(self, more: int) -> tuple[int, int]:
         return self.tile[0] + more, self.tile[1] + more
 
-    def _psfs(self, part: Part, size: tuple[int, int], correlate: bool) -> Tensor:
+    def _times_psfs(self, spectra: Tensor, part: Part, size: tuple[int, int], correlate: bool) -> Tensor:
+        """Return spectra (B, D' or 1, C, ...) times those of the PSFs of a part's layers."""
         if (key := (size, correlate)) not in self.spectra:
             self.spectra[key] = to_spectrum(self.psfs.flip((-2, -1)) if correlate else self.psfs, size)
-        return part.chosen(self.spectra[key])[:, part.channels]
+        psfs = self.spectra[key][:, part.channels]
+        if part.layers is None:
+            return spectra * psfs
+        count = len(part.layers)
+        found = spectra if spectra.shape[1] == count else spectra.new_empty(len(spectra), count, *spectra.shape[2:])
+        for n, layer in enumerate(part.layers):  # the PSFs are not copied
+            torch.mul(spectra[:, n % spectra.shape[1]], psfs[layer], out=found[:, n])
+        return found
 
-    def _labels(self, part: Part) -> tuple[Tensor, Tensor | None]:
-        index = part.numbered(part.window(self.index), len(self.psfs))
-        return index, None if self.weight is None else part.window(self.weight)
+    def _labels(self, part: Part, planes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return the two layers of each pixel, (B, 1, C, h, w), for planes (B, D', C, ...), and the weight of the second."""
+        below = part.numbered(part.window(self.index), len(self.psfs))[:, None, None]
+        below = below.expand(len(planes), 1, planes.shape[2], -1, -1)
+        weight = None if self.weight is None else part.window(self.weight)[:, None, None]
+        return below, (below + 1).clamp_(max=planes.shape[1] - 1), weight
 
-    def _own(self, light: Tensor, part: Part) -> Tensor:
-        """Return the light of each layer's own pixels, (B, D, C, h, w)."""
-        index, weight = self._labels(part)
+    def _own(self, pixels: Tensor, part: Part, size: tuple[int, int]) -> Tensor:
+        """Return the spectra of the light of each layer's own pixels, (B, D', C, ...)."""
+        light = part.window(pixels[:, part.channels])[:, None]
         count = len(self.psfs) if part.layers is None else len(part.layers)
-        layers = torch.arange(count, device=index.device)[:, None, None]
-        own = weight_of_layer(index[:, None], None if weight is None else weight[:, None], layers)
-        return own.to(light.dtype)[:, :, None] * light[:, None]
+        planes = light.new_zeros(len(light), count, *light.shape[2:-1], transform_side(size[1]))
+        below, above, weight = self._labels(part, planes)
+        own = planes[..., : light.shape[-1]]
+        if weight is not None:
+            moved = light * weight
+            own.scatter_(1, above, moved)
+            light = light - moved
+        own.scatter_(1, below, light)
+        return to_spectrum(planes, size)

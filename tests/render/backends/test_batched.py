@@ -121,7 +121,7 @@ class TestTiles(BaseTester):
         for part in BatchedBackend(chunk_bytes=1 << 20).parts(scene):
             counted[part.images, part.channels, part.rows, part.columns] += 1
             held = part.window(index, reach).unique()
-            assert part.layers.tolist() == sorted({*held.tolist(), *(held + 1).tolist()} & {*range(6)})
+            assert part.layers == sorted({*held.tolist(), *(held + 1).tolist()} & {*range(6)})
         assert bool((counted == 1).all())
 
     def test_feature_tiles_are_no_shorter_than_their_overlap_and_windows_no_larger_than_needed(self):
