@@ -14,7 +14,7 @@ from tests.render.scenes import Bank
 
 METHODS = ("auto", "batched", "dense")  # those that support small scenes too
 # Tiles so small, and chunks of so few of them, that a small scene has many of both.
-SMALL_TILES = BatchedBackend(smallest=16, chunk_bytes=100_000)
+SMALL_TILES = BatchedBackend(step=16, chunk_bytes=100_000)
 
 
 def render_by(

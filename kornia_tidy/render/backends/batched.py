@@ -26,7 +26,6 @@ from kornia_tidy.render.scene import SAMPLE, LayeredScene
 
 MOST_SAMPLES = 1 << 28  # of all layers of whole planes on an accelerator
 PART_BYTES = 672 << 20  # that the planes of a part may take on an accelerator
-_STEP = 16  # samples that divide windows on processors: transforms of other sizes take up to twice as long
 _PRODUCT = 6  # operations of a complex product
 _LAYERS = 6  # of a tile: beyond these planes channels are worked on one by one
 # Planes of a layer at a time, for occlusion in each channel: spectra, products, light and quotients.
@@ -38,11 +37,11 @@ class BatchedBackend:
     """Convolution of tiles in batches of transforms. See :class:`kornia_tidy.render.backend.Backend`.
 
     Args:
-        smallest: side of the smallest windows on a processor: calls of smaller ones take longer than their transforms.
+        step: samples that divide the windows on a processor: transforms of other sizes take up to twice as long.
         chunk_bytes: that the planes of a tile may take on a processor, near its cache (see allocator.py).
     """
 
-    smallest: int = 80
+    step: int = 64
     chunk_bytes: int = 15 << 20
 
     name = "batched"
@@ -91,7 +90,7 @@ class BatchedBackend:
         return Work(operations, memory + 4 * image + 16 * labels.layer_index.numel(), max(sides))
 
     def tile(self, scene: LayeredScene) -> tuple[int, int]:
-        """Return height and width of tiles: in windows of some 2.5 P pixels, or as large as an accelerator allows.
+        """Return height and width of tiles: in windows of 2 P pixels or more, or as large as an accelerator allows.
 
         Larger tiles waste less on their overlap, smaller ones hold fewer layers.
         """
@@ -99,7 +98,8 @@ class BatchedBackend:
         if _is_whole(scene):
             return size
         if scene.image.device.type == "cpu":
-            most = next(n for k in count(6) for n in (2**k, 5 * 2 ** (k - 2)) if n >= max(2 * side, 64 if scene.compositing == "occlusion" else 128)) - side + 1
+            windows = count(-(-2 * side // self.step) * self.step, self.step)
+            most = next(window for window in windows if transform_side(window) == window) - side + 1
         else:
             planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
             most = max(size)

@@ -44,13 +44,11 @@ class Part:
         """Return a tensor's entries of the part's layers."""
         return by_layer if self.layers is None else by_layer[self.layers]
 
-    def numbered(self, layer_index: Tensor, layers: int) -> Tensor:
+    def numbered(self, layer_index: Tensor) -> Tensor:
         """Return layers counted among the part's."""
         if self.layers is None:
             return layer_index
-        numbers = torch.zeros(layers, dtype=torch.long)
-        numbers[self.layers] = torch.arange(len(self.layers))
-        return numbers[layer_index]
+        return torch.bucketize(layer_index.contiguous(), torch.tensor(self.layers))
 
 
 class LayerBatches:
@@ -115,17 +113,18 @@ class LayerBatches:
         """Return the gradient of the PSFs, (D, C, P, P)."""
         size, found = self._size(self.side - 1), None
         for part in self.parts:
-            light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size).conj().resolve_conj()
-            own = self._own(pixels, part, size)
+            light = to_spectrum(part.window(plane[:, part.channels], self.side - 1), size)
+            own = self._own(pixels, part, size).conj_physical_()
+            if part.layers is None and part.channels == slice(0, pixels.shape[1]):
+                product = (own * light[:, None]).sum(0)
+                found = product if found is None else found + product
+                continue
             if found is None:
                 found = own.new_zeros(*self.psfs.shape[:2], *own.shape[-2:])
-            if part.layers is None:
-                found[:, part.channels] += (own * light[:, None]).sum(0)
-                continue
-            for n, layer in enumerate(part.layers):
+            for n, layer in enumerate(part.layers or range(len(self.psfs))):  # of one image
                 found[layer, part.channels].addcmul_(own[0, n], light[0])
         assert found is not None
-        total = from_spectrum(found.conj(), size, 1)[..., : self.side, : self.side]
+        total = from_spectrum(found, size, 1)[..., : self.side, : self.side]
         return total if correlate else total.flip((-2, -1))
 
     def _size(self, more: int) -> tuple[int, int]:
@@ -138,15 +137,15 @@ class LayerBatches:
         psfs = self.spectra[key][:, part.channels]
         if part.layers is None:
             return spectra * psfs
-        count = len(part.layers)
-        found = spectra if spectra.shape[1] == count else spectra.new_empty(len(spectra), count, *spectra.shape[2:])
-        for n, layer in enumerate(part.layers):  # the PSFs are not copied
-            torch.mul(spectra[:, n % spectra.shape[1]], psfs[layer], out=found[:, n])
+        spectra = spectra.expand(-1, len(part.layers), -1, -1, -1)
+        found = spectra.new_empty(spectra.shape)
+        for n, layer in enumerate(part.layers):  # without a copy of the layers' PSFs
+            torch.mul(spectra[:, n], psfs[layer], out=found[:, n])
         return found
 
     def _labels(self, part: Part, planes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return the two layers of each pixel, (B, 1, C, h, w), for planes (B, D', C, ...), and the weight of the second."""
-        below = part.numbered(part.window(self.index), len(self.psfs))[:, None, None]
+        """Return each pixel's layer below and above in planes (B, D', C, ...), and the weight of the one above."""
+        below = part.numbered(part.window(self.index))[:, None, None]
         below = below.expand(len(planes), 1, planes.shape[2], -1, -1)
         weight = None if self.weight is None else part.window(self.weight)[:, None, None]
         return below, (below + 1).clamp_(max=planes.shape[1] - 1), weight

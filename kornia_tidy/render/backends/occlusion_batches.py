@@ -67,12 +67,12 @@ def part_gradients(planes: OcclusionPlanes, parts: list[Part], gradient: Tensor)
 def _occluded(planes: OcclusionPlanes, part: Part) -> Tensor:
     """Render a part with the layers in it."""
     psfs, stray, dtype = part.chosen(planes.psfs), planes.stray_light, widest(planes.light.device)
-    side, count = psfs.shape[-1], len(planes.psfs)
+    side = psfs.shape[-1]
 
     def own(plane: Tensor) -> Tensor:
         return part.window(plane, side - 1)
 
-    index, weight = part.numbered(own(planes.layer_index), count)[:, None], planes.layer_weight
+    index, weight = part.numbered(own(planes.layer_index))[:, None], planes.layer_weight
     weight = None if weight is None else own(weight)[:, None].to(dtype)
     numbers = torch.arange(len(psfs), device=psfs.device)[:, None, None]
     alphas = [weight_of_layer(index, weight, numbers), cumulative_weight(index, weight, numbers)]

@@ -132,7 +132,7 @@ class TestTiles(BaseTester):
                 scene = layered_scene(image, defocus, bank.defocus, bank.psfs, border="replicate")
                 for side, tile in zip((height, width), BatchedBackend().tile(scene), strict=True):
                     assert -(-side // tile) <= 2 or tile >= size - 1
-                    assert tile + size - 1 <= max(80, 1.25 * 2.5 * size + 16)
+                    assert tile + size - 1 <= 1.25 * (2 * size + 64)
 
 
 @pytest.fixture(params=["whole planes", "parts of them", "one block", "tiles"])
