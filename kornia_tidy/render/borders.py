@@ -43,15 +43,9 @@ def largest_window(border: str, height: int, width: int) -> int:
     return limits.get(border, 2**31 - 1)
 
 
-def pad_border(image: Tensor, radius: int | tuple[int, int], border: str) -> Tensor:
-    """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` does not change them.
-
-    Two radii are those left and right, and above and below.
-    """
-    if border == "valid":
-        return image
-    across, down = (radius, radius) if isinstance(radius, int) else radius
-    return torch.nn.functional.pad(image, (across, across, down, down), mode=PAD_MODES[border])
+def pad_border(image: Tensor, radius: int, border: str) -> Tensor:
+    """Extend the last two axes of (B, C, H, W) by ``radius`` on each side; ``valid`` does not change them."""
+    return image if border == "valid" else torch.nn.functional.pad(image, (radius,) * 4, mode=PAD_MODES[border])
 
 
 def extended(image: Tensor, rows: tuple[int, int], columns: tuple[int, int], border: str) -> Tensor:
@@ -92,12 +86,6 @@ def cropped(tensor: Tensor, margin: int) -> Tensor:
         torch.Size([3, 4, 5])
     """
     return tensor[..., margin : tensor.shape[-2] - margin, margin : tensor.shape[-1] - margin]
-
-
-def padded_size(height: int, width: int, psf_size: int, border: str) -> tuple[int, int]:
-    """Return the height and width that :func:`pad_border` gives an image."""
-    extra = 0 if border == "valid" else 2 * (psf_size // 2)
-    return height + extra, width + extra
 
 
 def transform_side(pixels: int) -> int:

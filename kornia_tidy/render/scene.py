@@ -20,7 +20,7 @@ from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.kernels.places import Places
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
-from kornia_tidy.render.borders import BORDERS, PAD_MODES, check_border, pad_border, padded_size
+from kornia_tidy.render.borders import BORDERS, PAD_MODES, check_border, pad_border
 
 LAYER_MODES = ("nearest", "linear")
 SAMPLE = 8  # px between the rows and columns of a sample of the labels
@@ -105,7 +105,7 @@ class LayeredScene:
     @property
     def padded_size(self) -> tuple[int, int]:
         """Height and width of :attr:`plane`."""
-        return padded_size(*self.image.shape[-2:], self.psfs.shape[-1], self.border)
+        return self.plane.shape[-2], self.plane.shape[-1]
 
     @property
     def batch_weight(self) -> Tensor | None:

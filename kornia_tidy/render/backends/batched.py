@@ -102,11 +102,8 @@ class BatchedBackend:
             most = next(window for window in windows if transform_side(window) == window) - side + 1
         else:
             planes = _OCCLUSION_PLANES * scene.image.shape[1] if scene.compositing == "occlusion" else _PLANES
-            most = max(size)
-            while (
-                most > side
-                and self._plane_bytes(scene, (most + side, most + side)) * planes * len(scene.psfs) > PART_BYTES
-            ):
+            planes, most = planes * len(scene.psfs), max(size)
+            while most > side and planes * self._plane_bytes(scene, (most + side, most + side)) > PART_BYTES:
                 most = -(-most // 2)
         height, width = (-(-own // -(-own // most)) for own in size)  # alike, so that few sizes are transformed
         return height, width
@@ -121,11 +118,8 @@ class BatchedBackend:
         )
         lost = scene.psfs.shape[-1] - 1
         one = self._plane_bytes(scene, (transform_side(height + lost), transform_side(width + lost)))
-        here, occludes, most = (
-            scene.image.device.type == "cpu",
-            scene.compositing == "occlusion",
-            self._most_bytes(scene),
-        )
+        here, occludes = scene.image.device.type == "cpu", scene.compositing == "occlusion"
+        most = self._most_bytes(scene)
         layers, together, images = min(every, _LAYERS) if here else every, channels, 1
         if _is_whole(scene):
             images = max(1, most // (every * channels * one))

@@ -66,19 +66,16 @@ class LayerBatches:
         self.rim = 0 if scene.compositing == "scatter" and len(parts) == 1 else self.side - 1  # it would be cut
         self.index, weight = scene.sorted_layers
         self.weight = None if weight is None else weight.detach()
-        self.tile = [
-            max(own.stop - own.start for own in axis)
-            for axis in zip(*((p.rows, p.columns) for p in parts), strict=True)
-        ]
+        self.tile = parts[0].rows.stop, parts[0].columns.stop  # none is larger than the first
         self.spectra: dict[tuple[tuple[int, int], bool], Tensor] = {}
 
     def gather(self, plane: Tensor, *, correlate: bool = False, weight_gradient: bool = False) -> Tensor:
         """Return the gathered light (B, C, h, w) of a plane."""
-        found = [self._gathered(plane, part, correlate, weight_gradient) for part in self.parts]
-        if len(found) == 1:
-            return found[0]
+        if len(self.parts) == 1:
+            return self._gathered(plane, self.parts[0], correlate, weight_gradient)
         whole = plane.new_empty(*plane.shape[:2], *self.index.shape[-2:])
-        for part, own in zip(self.parts, found, strict=True):
+        for part in self.parts:
+            own = self._gathered(plane, part, correlate, weight_gradient)
             whole[part.images, part.channels, part.rows, part.columns] = own
         return whole
 
@@ -95,19 +92,18 @@ class LayerBatches:
 
     def scatter(self, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return the light that pixels scatter."""
-        whole: Tensor | None = None
+        if len(self.parts) == 1:
+            return self._scattered(pixels, self.parts[0], correlate)
+        whole = pixels.new_zeros(*pixels.shape[:2], *(side + self.rim for side in pixels.shape[-2:]))
         for part in self.parts:
-            size = self._size(self.rim)
-            own = self._own(pixels, part, size)
-            spread = from_spectrum(self._times_psfs(own, part, size, correlate).sum(1), size, 1)
-            if len(self.parts) == 1:
-                return spread
-            if whole is None:
-                whole = pixels.new_zeros(*pixels.shape[:2], *(side + self.rim for side in pixels.shape[-2:]))
             target = part.window(whole[:, part.channels], self.rim)
-            target.add_(spread[..., : target.shape[-2], : target.shape[-1]])
-        assert whole is not None
+            target.add_(self._scattered(pixels, part, correlate)[..., : target.shape[-2], : target.shape[-1]])
         return whole
+
+    def _scattered(self, pixels: Tensor, part: Part, correlate: bool) -> Tensor:
+        size = self._size(self.rim)
+        spectra = self._times_psfs(self._own(pixels, part, size), part, size, correlate)
+        return from_spectrum(spectra.sum(1), size, 1)
 
     def psf_gradient(self, plane: Tensor, pixels: Tensor, *, correlate: bool = False) -> Tensor:
         """Return the gradient of the PSFs, (D, C, P, P)."""
