@@ -34,6 +34,7 @@ _RINGS = ((0.0, 1), (0.5, 4), (0.9, 8))  # radius in the stop, and points there
 # most .25 for five random masks and .39 for three, .3 to .7 for a bare lens, .47 and more for one mask.
 _OF_PAIRS, _OF_PAIRS_OF_FEW = 0.4, 0.7
 _FEW = 2
+_LEAST = 1e-9  # error of a cell: less makes no cell smaller
 
 
 @on_cpu
@@ -87,10 +88,24 @@ def field_nodes(
     counts = torch.arange(1, MOST_NODES + 1)
     places = torch.where(errors <= max(tolerance, float(errors.min())), counts[:, None] * counts, MOST_NODES**2 + 1)
     rows, columns = divmod(int(places.argmin()), MOST_NODES)
-    bend, slope = max(bends), max(slopes)
-    cell = min(CELLS[1], int(math.sqrt(tolerance / bend))) if bend > 0 else CELLS[1]
-    still = min(CELLS[1], int(tolerance / slope)) if slope > 0 else CELLS[1]
-    return Field(size, (rows + 1, columns + 1), center, cell=max(CELLS[0], cell), still=still)
+    cell, still = cells_within(tolerance, max(slopes), max(bends))
+    return Field(size, (rows + 1, columns + 1), center, cell=cell, still=still)
+
+
+def cells_within(tolerance: float, slope: float, bend: float) -> tuple[int, int]:
+    """Return the sides in pixels of the largest cells in which PSFs may be taken to first order, and as in the middle.
+
+    Args:
+        tolerance: of PSFs.
+        slope: error of the middle's value in a cell, over its pixels.
+        bend: error of the first order there, over the square of its pixels.
+
+    Example:
+        >>> cells_within(1e-2, 2e-4, 4e-6)
+        (50, 50)
+    """
+    first, value = math.sqrt(tolerance / max(bend, _LEAST)), tolerance / max(slope, _LEAST)
+    return max(CELLS[0], min(CELLS[1], int(first))), min(CELLS[1], int(value))
 
 
 @lru_cache(maxsize=32)

@@ -469,12 +469,3 @@ class TurnedLens:
         return torch.cat(
             [torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64), torch.cat([centres, self.edges[:, 1:]], 1)]
         )
-
-    def phase(self, polynomials: Tensor) -> Tensor:
-        """Return the wavefront in radians at the wavelength, (J, ...) to (D, ...)."""
-        return wavefronts([self], polynomials.flatten(1))[0][0].unflatten(-1, polynomials.shape[1:])
-
-    def frequencies(self, polynomials: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the direction cosines along x and y in which light arrives, less the chief ray's."""
-        y, x = wavefronts([self], polynomials.flatten(1))[1][0].unflatten(-1, polynomials.shape[1:])
-        return x, y

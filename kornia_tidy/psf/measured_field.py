@@ -15,7 +15,7 @@ from torch import Tensor
 
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.psf.field import Field, chebyshev_points, lagrange
-from kornia_tidy.psf.field_nodes import CELLS, MOST_NODES
+from kornia_tidy.psf.field_nodes import MOST_NODES, cells_within
 
 _FINE = 17  # places along a side at which PSFs between nodes are compared
 
@@ -85,12 +85,10 @@ def measured_nodes(
         between = torch.einsum("ya,xb,abf->yxf", along, along, weights_at(chebyshev_points(count)))
         if float(norm(between - exact).max()) <= tolerance:
             break
-    step, cell, still = float(fine[1] - fine[0]), CELLS[1], CELLS[1]
+    slope, bend = 0.0, 0.0
     for axis in (0, 1):  # as of lenses, see field_nodes
-        slope = float(norm(exact.diff(dim=axis)).max()) / step / math.sqrt(3)
-        bend = float(norm(exact.diff(n=2, dim=axis)).max()) / step**2 / math.sqrt(45)
-        if bend > 0:
-            cell = max(CELLS[0], int(min(cell, 2 * half[axis] * math.sqrt(tolerance / bend))))
-        if slope > 0:
-            still = int(min(still, 2 * half[axis] * tolerance / slope))
+        step = float(fine[1] - fine[0]) * max(2 * half[axis], 1)
+        slope = max(slope, float(norm(exact.diff(dim=axis)).max()) / step / math.sqrt(3))
+        bend = max(bend, float(norm(exact.diff(n=2, dim=axis)).max()) / step**2 / math.sqrt(45))
+    cell, still = cells_within(tolerance, slope, bend)
     return Field(size, (count, count), center, cell=cell, still=still)

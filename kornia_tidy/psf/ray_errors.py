@@ -18,7 +18,7 @@ from torch import Tensor
 
 from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.zernike import zernike_polynomials
-from kornia_tidy.psf.lens_psfs import TurnedLens
+from kornia_tidy.psf.lens_psfs import TurnedLens, wavefronts
 
 _STEP = 1e-4  # of differences over the stop, in its radii
 
@@ -76,7 +76,6 @@ def _slopes(turned: TurnedLens, y: Tensor, x: Tensor, axis: int) -> tuple[Tensor
     step = torch.tensor([-_STEP, _STEP], dtype=torch.float64)[:, None]
     y, x = (y + step, x.expand(2, -1)) if axis == 0 else (y.expand(2, -1), x + step)
     polynomials = zernike_polynomials((turned.degree + 1) * (turned.degree + 2) // 2, y, x)
-    waves = turned.phase(polynomials) * turned.wavelength / (2 * math.pi)
-    along, across = turned.frequencies(polynomials)
-    cosines = torch.stack([across, along], -1)
-    return (waves[:, 1] - waves[:, 0]) / (2 * _STEP), (cosines[1] - cosines[0]) / (2 * _STEP)
+    phases, cosines = (part[0].unflatten(-1, (2, -1)) for part in wavefronts([turned], polynomials.flatten(1)))
+    slopes, bends = ((part[:, 1] - part[:, 0]) / (2 * _STEP) for part in (phases, cosines))
+    return slopes * turned.wavelength / (2 * math.pi), bends.T
