@@ -804,7 +804,8 @@ class PSFModel:
         if self.aperture is None or (amplitude := self._amplitude) is None:
             return pupil
         shown = self.state if self.moment is None else self.moment
-        times = self.timeline(torch.promote_types(self.masks.phase.dtype, torch.float32)).durations
+        dtype = torch.promote_types(self.masks.phase.dtype, torch.float32)
+        times = amplitude.new_ones(1) if amplitude.ndim == 2 else self.timeline(dtype).durations
         if shown is not None and amplitude.ndim == 3:
             amplitude, times = amplitude[shown : shown + 1], torch.ones_like(times[:1])
         return pupil.with_amplitude(amplitude, times, cut=self.lens is not None)
