@@ -71,7 +71,8 @@ class Pupil:
             shares: fraction of the exposure of each mask, (K,), to average the light of several amplitudes.
             cut: whether a lens's stop cuts them too. Otherwise each is scaled to let a light of one through.
         """
-        pupil, passed = copy.copy(self), amplitude.double().square()
+        pupil = copy.copy(self)
+        passed = amplitude.double().square()
         if passed.ndim == 3:
             passed = torch.tensordot(shares.to(passed), passed, 1)
         light = amplitude.square().sum((-2, -1), keepdim=True) * self.cell_pitch**2
