@@ -79,7 +79,8 @@ static desk take_desk(pool *p, const waves *s, vec *fields) {
     desk d = {vecs, vecs * LANES, rows, plane, .fields = fields};
     d.left = take_zeros(p, wave, sizeof(vec)), d.right = take_zeros(p, wave, sizeof(vec));
     d.pixels = take(p, s->window * plane, sizeof(vec)), d.intensity = take_zeros(p, LINES * plane, sizeof(vec));
-    d.turned = take_zeros(p, s->window * LINES + 2 * d.pitch, sizeof(REAL)), d.form = take_zeros(p, 2 * s->cells * vecs, sizeof(vec));
+    d.turned = take_zeros(p, s->window * LINES + 2 * d.pitch, sizeof(REAL));
+    d.form = take_zeros(p, 2 * s->cells * vecs, sizeof(vec));
     d.kernel = take_zeros(p, learns * points, sizeof(vec)), d.sums = take_zeros(p, learns * 2 * s->states * plane, sizeof(vec));
     for (int n = 0; n < 2; n++) d.gradients[n] = take(p, learns * s->states * points, sizeof(vec));
     return d;

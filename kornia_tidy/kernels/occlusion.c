@@ -657,7 +657,8 @@ static int64_t nodes_of(const scene_parameters *s) { return s->over.node_rows ? 
 
 static tally take_tally(pool *p, const scene_parameters *s) {
     const int64_t planes = s->layers * s->channels, area = s->side * s->side, pitch = (s->side + LANES - 1) / LANES * LANES;
-    tally t = {.pitch = pitch, .size = (s->side + LINES - 1) / LINES * LINES * pitch, .lines = take_lines(p, &s->over, planes, area)};
+    tally t = {.pitch = pitch, .size = (s->side + LINES - 1) / LINES * LINES * pitch};
+    t.lines = take_lines(p, &s->over, planes, area);
     const int64_t numbers = nodes_of(s) * planes * area;
     t.tables = take_zeros(p, planes * table_size(s), sizeof(double));
     t.psfs = take_zeros(p, numbers + planes + s->images * s->channels, sizeof(double));
@@ -932,7 +933,8 @@ int occlusion_gradients(const scene_parameters *s) {
 #pragma omp parallel for schedule(static, 1) num_threads(s->threads)
     for (int64_t thread = 0; thread < threads; thread++) {
         tally *t = tallies + thread;
-        for (int64_t n = bands * thread / threads; n < bands * (thread + 1) / threads; n++) go_back(s, spaces + thread, t, tables, n);
+        for (int64_t n = bands * thread / threads; n < bands * (thread + 1) / threads; n++)
+            go_back(s, spaces + thread, t, tables, n);
         for (int64_t n = 0; n < tables_of(s); n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
         for (int64_t n = 0; s->over.node_rows && n < numbers; n++)
             t->psfs[n] = ((REAL *)t->nodes)[n / area * t->lines.vectors * LANES + n % area];

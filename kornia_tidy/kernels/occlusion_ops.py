@@ -117,11 +117,22 @@ def occlusion_direct_gradients(
     found = [x.new_empty(x.shape) if want and x is not None else None for x, want in zip(tensors, wanted, strict=True)]
     yield [x for x in found if x is not None]
     extra = _rim(psfs)
-    own = [x if x is None or x.ndim == 2 else pad(x, (extra,) * 4) for x in found]
+    own = [x if x is None else x.new_empty(*x.shape[:-2], *(n + 2 * extra for n in x.shape[-2:])) for x in found[:2]]
     scene = _fields(plane, psfs, layer_index, layer_weight, inside, places)
-    call(load(SOURCE, light.dtype).occlusion_gradients, *scene, mean, stray_light, None, gradient, *own, None, 0)
-    for x, made in zip(found, own, strict=True):
-        if x is not None and made is not None and made is not x:
+    call(
+        load(SOURCE, light.dtype).occlusion_gradients,
+        *scene,
+        mean,
+        stray_light,
+        None,
+        gradient,
+        *own,
+        *found[2:],
+        None,
+        0,
+    )
+    for x, made in zip(found[:2], own, strict=True):
+        if x is not None and made is not None:
             turned = made.mT.flip((-2, -1)) if x is found[1] else made
             x.copy_(turned[..., extra : extra + x.shape[-2], extra : extra + x.shape[-1]])
 
@@ -203,7 +214,7 @@ def _fields(
     inside: Tensor | None = None,
     places: Sequence[Tensor] | None = None,
 ) -> tuple[Any, ...]:
-    """Return the fields of a scene in occlusion.c up to those of ``places``."""
+    """Return the fields of a scene in occlusion.c up to its layers' weights."""
     index, weight = layer_index.to(plane.dtype), layer_weight
     if weight is not None:  # a pixel with a weight of one lies in the next layer alone
         full = weight == 1

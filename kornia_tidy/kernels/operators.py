@@ -14,7 +14,7 @@ from typing import Any, NoReturn, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-NO_MEMORY, REFUSED = 1, 2  # status of functions in C: REFUSED is of values that they cannot use
+NO_MEMORY = 1  # status of functions in C, see vectors.h
 
 _TYPES = {
     "int": "SymInt",
@@ -182,7 +182,8 @@ def call(function: Any, *fields: Tensor | float | tuple[Any, ...] | None) -> int
     Args:
         function: of a library.
         fields: of the struct after the first one, which is the number of threads. All are of 64 bits: whole numbers,
-            double ones, and pointers to contiguous tensors or to those of :func:`strided`. None is a null pointer.
+            double ones, and pointers to tensors, which are made contiguous. None is a null pointer. A tuple holds
+            several fields, with tensors as they lie in memory.
 
     Raises:
         MemoryError: if memory is missing.

@@ -187,7 +187,8 @@ def _fill(
         return
     step, most = size_step(out.dtype), size - side + 1
     field = fields_of(places, (height, width), (most, most), out.dtype)
-    largest = [int(edges.diff().max()) for edges in field[4:6]] if places else (height, width)
+    edges = (Places(*places).row_edges, Places(*places).column_edges) if places else ()
+    largest = [int(axis.diff().max()) for axis in edges] or [height, width]
     window = needed_side(size, largest[0], side, step // 2), needed_side(size, largest[1], side, step)
     origin = (side - 1) * (correlate == (function == "scatter"))
     numbers = images, channels, height, width, layers, side, *window, origin, correlate, weight_gradient

@@ -606,7 +606,8 @@ static int compute_place(work *w, int64_t place) {
     for (int64_t n = 0; !p.missing && n < 4 * s->exposures * s->shifts; n++) {
         const int64_t at = (place * s->exposures * s->shifts + n / 4) * s->window * s->samples, back = n % 4 >= 2;
         if (back && !s->gradient) continue;
-        w->pixels[n] = lay_out(&p, (n % 2 ? s->rows : s->columns) + at, back ? s->samples : s->window, back ? s->window : s->samples, back);
+        const int64_t height = back ? s->samples : s->window, width = back ? s->window : s->samples;
+        w->pixels[n] = lay_out(&p, (n % 2 ? s->rows : s->columns) + at, height, width, back);
     }
     if (!p.missing) {
         fill_weights(w, places);

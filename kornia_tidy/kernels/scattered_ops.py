@@ -129,8 +129,9 @@ def _backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
     if not torch.is_grad_enabled():
         found = scattered_light_gradients(waves, weights, *rest, gradient)
     else:  # the gradients are differentiated in turn
-        light = lambda *own: scattered_light_by_torch(*own, *rest)  # noqa: E731
-        found = differentiable_gradients(light, (waves, weights), gradient, ctx.needs_input_grad[:2])
+        found = differentiable_gradients(
+            lambda *own: scattered_light_by_torch(*own, *rest), (waves, weights), gradient, ctx.needs_input_grad[:2]
+        )
     return *found, [None] * 4, None, [None] * 3, None, None
 
 

@@ -155,7 +155,8 @@ enum { ALIGNED = 64, HUGE_PAGE = 2 << 20 };
 // A buffer that begins with a whole vector, and may be read one before its begin and behind its end. A large one lies in huge
 // pages where the system has them, because columns jump from page to page.
 static inline void *take(pool *p, int64_t count, size_t size) {
-    const size_t bytes = count * size + 2 * ALIGNED, unit = bytes < 2 * HUGE_PAGE ? ALIGNED : HUGE_PAGE, whole = (bytes + unit - 1) / unit * unit;
+    const size_t bytes = count * size + 2 * ALIGNED, unit = bytes < 2 * HUGE_PAGE ? ALIGNED : HUGE_PAGE;
+    const size_t whole = (bytes + unit - 1) / unit * unit;
     char *memory = aligned_alloc(unit, whole);
     p->missing |= !memory;
     if (!memory) return 0;
