@@ -266,12 +266,8 @@ class PlannedScene:
 
     def work_over_field(self, fidelity: Fidelity, field: Field) -> Work:
         """Return the work of a capture with its PSFs at the places of a field."""
-        planner, (bank, rendering) = self.planner, self._works(fidelity)
-        layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        if not self._occlusion:
-            given = layers, self._rendered(fidelity), window_side(fidelity), fidelity.double
-            rendering = self._rendering(*given, field)
-        places = len(field.points)
+        bank, rendering = self._works(fidelity, None if self._occlusion else field)
+        planner, places = self.planner, len(field.points)
         operations = planner.captures * (places * bank.operations + rendering.operations)
         return Work(operations, max(round(planner.captures * places * bank.memory), rendering.memory))
 
@@ -488,18 +484,16 @@ class PlannedScene:
         nodes = self.planner.nodes(fidelity.layers, fidelity.layer_spacing)
         return fine_nodes(nodes) if fidelity.layers in TAPS else nodes
 
-    def _works(self, fidelity: Fidelity) -> tuple[Work, Work]:
+    def _works(self, fidelity: Fidelity, field: Field | None = None) -> tuple[Work, Work]:
         """Return the work of a bank of PSFs and of the renderer, for one capture of the scene."""
         planner, (computed, _) = self.planner, self._layers(fidelity.layers, fidelity.layer_spacing)
         layers = "nearest" if fidelity.layers == "nearest" else "linear"
-        rendering = self._rendering(layers, self._rendered(fidelity), window_side(fidelity), fidelity.double)
-        spectrum = planner.spectrum_of(fidelity.wavelengths)
-        return bank_work(planner.model, spectrum, planner.together, fidelity, computed), rendering
+        bank = bank_work(planner.model, planner.spectrum_of(fidelity.wavelengths), planner.together, fidelity, computed)
+        nodes, window = self._rendered(fidelity), window_side(fidelity)
+        return bank, self._rendering(layers, nodes, window, fidelity.double, field)
 
     @remembered
-    def _rendering(
-        self, layers: str, nodes: tuple[float, ...], window: int, double: bool, field: Field | None = None
-    ) -> Work:
+    def _rendering(self, layers: str, nodes: tuple[float, ...], window: int, double: bool, field: Field | None) -> Work:
         planner, given = self.planner, (self._defocus, self.images, self.planner.planes, nodes, window)
         how = {"layers": layers, "compositing": planner.compositing, "border": planner.border, "double": double}
         return rendering_work(*given, **how, field=field)
