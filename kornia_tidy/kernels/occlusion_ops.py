@@ -119,18 +119,8 @@ def occlusion_direct_gradients(
     extra = _rim(psfs)
     own = [x if x is None else x.new_empty(*x.shape[:-2], *(n + 2 * extra for n in x.shape[-2:])) for x in found[:2]]
     scene = _fields(plane, psfs, layer_index, layer_weight, inside, places)
-    call(
-        load(SOURCE, light.dtype).occlusion_gradients,
-        *scene,
-        mean,
-        stray_light,
-        None,
-        gradient,
-        *own,
-        *found[2:],
-        None,
-        0,
-    )
+    results = None, gradient, *own, *found[2:], None, 0
+    call(load(SOURCE, light.dtype).occlusion_gradients, *scene, mean, stray_light, *results)
     for x, made in zip(found[:2], own, strict=True):
         if x is not None and made is not None:
             turned = made.mT.flip((-2, -1)) if x is found[1] else made

@@ -294,13 +294,18 @@ static void analyse(const work *w, const vec *light, wave *column, wave *spectru
     analyse_times(w, light, w->s->rows, w->s->rows, 2 * w->groups, VALUE, 0, column, spectrum);
 }
 
-// Multiplies by a spectrum, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
-static void multiply(const wave *x, const wave *psf, int64_t count, int sign, int add, wave *product) {
+INLINE void multiply_by(const wave *x, const wave *psf, int64_t count, REAL sign, int add, wave *product) {
     for (int64_t k = 0; k < count; k++) {
-        const vec im = (REAL)sign * psf[k].im;
+        const vec im = sign * psf[k].im;
         const wave z = {x[k].re * psf[k].re - x[k].im * im, x[k].re * im + x[k].im * psf[k].re};
         product[k] = add ? sum(product[k], z) : z;
     }
+}
+
+// Multiplies by a spectrum, or by its conjugate: `sign` -1. Writes to `product` or adds to it.
+static void multiply(const wave *x, const wave *psf, int64_t count, int sign, int add, wave *product) {
+    if (sign < 0) multiply_by(x, psf, count, -1, add, product);
+    else multiply_by(x, psf, count, 1, add, product);
 }
 
 // The sign for the spectrum of a PSF.
