@@ -179,7 +179,8 @@ class ThinLensCamera(nn.Module):
         hyperfocal = focal_length * aperture_diameter / pixel_pitch  # infinity is within a pixel
         farthest = min(like_infinity(self.aperture_radius), hyperfocal)
         warn_of_metres(["focus_distance"], [focus], focal_length, farthest)
-        warn_of_metres(["depth_range"], [near], focal_length, min(farthest, OTHER_FOCUS * focus))
+        if depth_range is not None:
+            warn_of_metres(["depth_range"], [near], focal_length, min(farthest, OTHER_FOCUS * focus))
         scale = math.pi * self.aperture_radius**2 / REFERENCE_WAVELENGTH
         # Plain numbers, so that the defocus nodes of a PSF bank do not move with a learnable focus.
         self.defocus_range = (scale * (1 / far - 1 / focus), scale * (1 / near - 1 / focus))

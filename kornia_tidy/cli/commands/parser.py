@@ -72,6 +72,8 @@ class Parser(argparse.ArgumentParser):
             word = message.split()[2].partition("=")[0]
             meant = difflib.get_close_matches(word, self._option_string_actions, 1)
             message = f"there is no {word}" + (f" (did you mean {meant[0]}?)" if meant else " here")
+            if not word.startswith("-"):
+                message = f"{word} must have the name of its option before it"
         raise ValueError(f"{message}; see {self.prog} --help")
 
     def _print_message(self, message: str, file: Any = None) -> None:

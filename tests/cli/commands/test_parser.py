@@ -129,6 +129,7 @@ class TestRead(BaseTester):
             (["a", "-o", "b", "--pitch", "x"], "--pitch must be a number of metres above 0, got 'x'"),
             (["a", "-o", "b", "--othr", "1"], "there is no --othr (did you mean --"),
             (["a", "-o", "b", "--other", "1"], "there is no --other"),
+            (["a", "-o", "b", "b.png"], "b.png must have the name of its option before it"),
         ],
     )
     def test_exception_names_the_option(self, words, sentence):
