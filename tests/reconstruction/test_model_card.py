@@ -9,10 +9,11 @@ import torch
 
 from kornia_tidy import PixelwiseMask, TiDyOptics
 from kornia_tidy.reconstruction.model_card import model_card
-from kornia_tidy.reconstruction.pretrained import PRETRAINED, load_pretrained, pretrained_record
+from kornia_tidy.reconstruction.pretrained import PRETRAINED, pretrained_record
 from kornia_tidy.reconstruction.settings import SystemSettings
 from kornia_tidy.reconstruction.trained import TrainedSystem
 from tests.base import BaseTester
+from tests.reconstruction.shipped import shipped
 
 SECTIONS = ["Use", "Camera and network", "Training", "Scores", "Intended use", "Limits", "Licence", "Citation"]
 
@@ -24,7 +25,7 @@ def untrained(**settings):
 class TestModelCard(BaseTester):
     @pytest.mark.parametrize("name", PRETRAINED)
     def test_smoke_sections_of_each_shipped_system(self, name):
-        card = model_card(load_pretrained(name)._replace(record=pretrained_record(name)), name, "apache-2.0")
+        card = model_card(shipped(name)._replace(record=pretrained_record(name)), name, "apache-2.0")
         assert re.findall(r"^## (.*)$", card, re.MULTILINE) == SECTIONS
         for table in re.findall(r"(?:^\|.*\n)+", card, re.MULTILINE):
             assert len({line.count("|") for line in table.splitlines()}) == 1

@@ -27,6 +27,7 @@ from kornia_tidy.reconstruction.trained import load_trained, load_weights
 from kornia_tidy.training.evaluation import evaluate, mean_row
 from tests.base import BaseTester
 from tests.benchmarks.shipped_files import ship
+from tests.reconstruction.shipped import shipped
 
 MEGABYTES = 25  # that all of them may take
 
@@ -35,7 +36,7 @@ class TestPretrained(BaseTester):
     @pytest.mark.parametrize("name", PRETRAINED)
     def test_feature_beats_its_capture_on_new_scenes(self, name):
         """The scores that heads.json tells, on other scenes than those it was measured on."""
-        system = load_pretrained(name)
+        system = shipped(name)
         task, kind = name.split("-")
         masks = {"designed": 5, "flat": 1, "uncertain": 5}
         assert (system.settings.task, system.settings.masks) == (task, masks.get(kind) or int(kind))

@@ -14,7 +14,7 @@ from kornia_tidy import DefocusRange, ThinLensCamera
 from kornia_tidy.reconstruction.depth_distribution import distribution_loss
 from kornia_tidy.reconstruction.heads import make_head
 from kornia_tidy.reconstruction.metrics import psnr, ssim
-from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED, load_pretrained
+from kornia_tidy.reconstruction.pretrained import FOLDER, PRETRAINED
 from kornia_tidy.reconstruction.settings import RENAMED, SystemSettings
 from kornia_tidy.reconstruction.state_file import read_state, write_state
 from kornia_tidy.reconstruction.tasks import (
@@ -30,6 +30,7 @@ from kornia_tidy.training.random_state import own_random_state, random_state, ra
 from kornia_tidy.training.settings import JOINT_RUN, NETWORK_RUN, TrainingSettings, usual_settings
 from kornia_tidy.training.task_loss import LOSSES, task_loss
 from tests.base import BaseTester
+from tests.reconstruction.shipped import shipped
 
 
 def draws():
@@ -242,7 +243,7 @@ class TestSettings(BaseTester):
     @pytest.mark.parametrize("name", PRETRAINED)
     def test_feature_a_checkpoint_tells_the_settings_of_its_run(self, name):
         stored = json.loads(json.dumps(read_state(FOLDER / f"{name}.safetensors")["settings"]))
-        settings = json.loads(json.dumps(TrainingSettings.of(load_pretrained(name)).as_dict()))
+        settings = json.loads(json.dumps(TrainingSettings.of(shipped(name)).as_dict()))
         assert {key: settings[RENAMED.get(key, key)] for key in stored} == stored
 
     @pytest.mark.parametrize(
