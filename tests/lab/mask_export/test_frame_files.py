@@ -127,7 +127,7 @@ class TestReadSLMFrames(BaseTester):
     @given(
         st.integers(1, 10),
         st.tuples(st.integers(1, 3), st.integers(1, 7), st.integers(1, 7)),
-        st.floats(2, 14),
+        st.floats(2, 4 * math.pi),
         st.sampled_from(FLIPS),
         st.sampled_from(ROTATIONS),
         st.floats(0.6, 5),
