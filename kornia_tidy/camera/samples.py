@@ -263,18 +263,15 @@ def defocus_extremes(parts: Iterable[Tensor], camera: CheckedCamera, depth: Tens
         extremes = torch.stack([lowest, highest])
         pixels += own.numel()
     camera.notes.clamped = clamped
-    if (
-        camera.check_inputs
-        and pixels
-        and (isinstance(clamped, Tensor) or float(extremes[1]) <= lo + max(SAME_FOCUS, -lo / OTHER_FOCUS))
-    ):
+    farthest = lo + max(SAME_FOCUS, -lo / OTHER_FOCUS)  # as far out of focus as infinity
+    if camera.check_inputs and pixels and (isinstance(clamped, Tensor) or float(extremes[1]) <= farthest):
         warn_of_defocus(depth, camera, extremes, int(clamped))
     if fixed is not None:
         return torch.tensor(fixed, requires_grad=reach is not None and reach.requires_grad)
     return extremes if reach is None else reach
 
 
-def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, camera: Any) -> Tensor:
+def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, camera: CheckedCamera) -> Tensor:
     """Return how far the defocus of a scene on an accelerator reaches, and check the scene and the masks.
 
     The host waits for an accelerator once, for the extremes of image, depth, defocus and masks together, and not at all
@@ -284,7 +281,7 @@ def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, 
         image: of the scene, (B, C, H, W).
         depth: of the scene.
         defocus: of the scene in radians.
-        camera: a :class:`~kornia_tidy.TiDyOptics` at one moment.
+        camera: at one moment.
 
     Returns:
         Lowest and highest defocus in radians, (2,), as far as PSFs are needed for it.
@@ -295,7 +292,8 @@ def defocus_extremes_in_one_read(image: Tensor, depth: Tensor, defocus: Tensor, 
     if fixed is not None or not own.numel():
         return torch.tensor(fixed or (lo, hi), requires_grad=defocus.requires_grad)
     states, weights = camera.psf_model.states(own.dtype)
-    aperture = list(camera.aperture.parameters()) if isinstance(camera.aperture, nn.Module) else []
+    learnt = camera.psf_model.aperture
+    aperture = list(learnt.parameters()) if isinstance(learnt, nn.Module) else []
     looked_at = image, depth, own, states, weights, *aperture
     pairs = [torch.aminmax(x.detach()) for x in looked_at if x.numel()]
     numbers = torch.stack([end.to(own.dtype) for pair in pairs for end in pair]).tolist()
