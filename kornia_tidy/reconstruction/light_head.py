@@ -21,6 +21,7 @@ from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.restored_over_field import restored_over_field
+from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 from kornia_tidy.reconstruction.self_ensemble import self_ensemble
 from kornia_tidy.reconstruction.tasks import MAPS, depth_logits, deviation_in_metres, metres, split_maps
 from kornia_tidy.reconstruction.tiled import OVERLAP, check_seamless, one_tile, reconstruct_tiled, shared_copy
@@ -188,12 +189,16 @@ def reconstruct_light(
 
 
 def _with_least_noise(head: LightHead, least: float, level: float) -> LightHead:
-    """Return a head with even noise of at least ``least``; the head itself if it was given its noise."""
+    """Return a head with even noise of at least ``least``, that of JPEG; the head itself if it was given its noise."""
     if not least or head.noise is not None or (told := _told_noise(head)) is None:
         return head
     copied = cast("LightHead", shared_copy(head))
     copied.field = head.field
-    copied.noise = max(least, told.std(level))
+    own = told.std(level)
+    copied.noise = max(least, own)
+    for part in copied.modules():
+        if isinstance(part, RuledClosedForm) and least > own:  # more noise of the sensor is left by JPEG
+            part.in_differences = 0.0
     return copied
 
 

@@ -38,6 +38,7 @@ TIKHONOV = (3e-2, 1e-2, 3e-3, 1e-3)  # weights of the filters that follow, whose
 FILTERS = len(NOISES) + len(TIKHONOV)
 BEFORE_BILATERAL = 0.3  # of the variance of noise: how much the kernel takes it for, as a bilateral filter follows
 CONTENT = (0.003, 4.0)  # least and largest ratio of a scene's fine detail to that of photographs
+IN_DIFFERENCES = 2.0  # of the variance of white noise: its power in the differences of neighbours
 LEAST_DETAIL = 0.1  # of the variance of noise: below it nothing is known of the scene
 STEPS = 20  # places between two kernels among which the best is sought
 COLORS = tuple(0.01 * 2 ** (i / 2) for i in range(11))  # 0.01 to 0.32, widths of the bilateral filter in colour
@@ -110,6 +111,8 @@ class RuledClosedForm(ClosedForm):
           picture, see :func:`~kornia_tidy.reconstruction.whole_picture.whole_picture`; a map of noise that does not
           follow from the sensor then counts by its mean over the tile.
         - No gradient reaches the settings.
+        - ``in_differences`` is the power of noise in differences of neighbours, over its variance. It is 2 for white
+          noise, and 0 for captures from JPEG, which takes most of it away there.
 
     Source: Wiener (1949); Tomasi and Manduchi, Bilateral Filtering (ICCV 1998); Stein, Estimation of the mean of a
     multivariate normal distribution (Annals of Statistics 9(6), 1981); Ramani et al., Monte-Carlo SURE (IEEE TIP
@@ -134,6 +137,7 @@ class RuledClosedForm(ClosedForm):
 
     def __init__(self, layers: int = 0, *, encoded: bool = True) -> None:
         super().__init__(layers, encoded=encoded, inverse="wiener")
+        self.in_differences = IN_DIFFERENCES
         self.remembered: dict[float | None, Settings] = {}  # of the sample, by the noise told; None: the sensor's
         places = STEPS * (FILTERS - 1) + 1
         for name, shape in (("norms", (places,)), ("scene_errors", (places,)), ("photographs_detail", ())):
@@ -239,7 +243,8 @@ class RuledClosedForm(ClosedForm):
         light = windows[0][0]
         facts = zip(*(self._facts(*one) for one in windows), strict=True)
         detail, variance, slope = (torch.stack(each).mean(0) for each in facts)
-        power = (detail - 2 * variance).clamp(min=LEAST_DETAIL * variance) / self.photographs_detail.to(light)
+        of_scene = (detail - self.in_differences * variance).clamp(min=LEAST_DETAIL * variance)
+        power = of_scene / self.photographs_detail.to(light)
         content = power.maximum(CONTENT[0] * slope).minimum(CONTENT[1] * slope)
         left = BEFORE_BILATERAL * variance[:, None] * self.norms.square().to(light)
         cost = content[:, None] * self.scene_errors.to(light) + left

@@ -26,6 +26,7 @@ from kornia_tidy.reconstruction.any_camera import any_camera_head, beside_clippe
 from kornia_tidy.reconstruction.capture_checks import JPEG_NOISE
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 from kornia_tidy.reconstruction.kernel_convolution import convolve_kernels
+from kornia_tidy.reconstruction.ruled_closed_form import IN_DIFFERENCES
 from kornia_tidy.reconstruction.state_file import write_state
 from kornia_tidy.seeds import keyed_seed
 from kornia_tidy.training.average import MovingAverage
@@ -194,6 +195,7 @@ def batch(cameras: Cameras, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor, 
             noisy = torch.cat([compressed(one[None], round(low + (high - low) * chance[6])) for one in noisy])
             told = torch.full_like(told, max(JPEG_NOISE, float(told.square().mean().sqrt())))
         form = cameras.form(name, 1 + int(chance[3] / MISTAKEN * MISTAKES) if chance[3] < MISTAKEN else 0)
+        form.in_differences = 0.0 if chance[5] < COMPRESSED else IN_DIFFERENCES
         capture = linear_rgb_to_rgb(noisy)
         found = form.settings_of(capture, told)
         restored = form.restore_by(capture, found)
