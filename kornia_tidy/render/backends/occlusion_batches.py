@@ -20,7 +20,6 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from kornia_tidy.kernels.precision import widest
 from kornia_tidy.render.backend import GradientPairs, gradient_pairs
@@ -85,17 +84,16 @@ def _occluded(planes: OcclusionPlanes, part: Part) -> Tensor:
         mean = planes.mean[part.images, None, :, None, None].to(dtype)
         light = torch.lerp(light, mean, part.chosen(stray)[..., None, None].to(dtype))
     spectra = to_spectrum(psfs.to(dtype), size)
-    seen = from_spectrum(to_spectrum(alpha[:, :, :1] * light, size) * spectra, size, 1)
-    both = from_spectrum(to_spectrum(alpha, size)[:, :, :, None] * spectra[:, None], size, 1)
-    return cast("Tensor", _LayOver.apply(seen, both.expand(len(seen), -1, -1, -1, -1, -1), side - 1))
+    seen = from_spectrum(to_spectrum(alpha[:, :, :1] * light, size) * spectra, size, side)
+    both = from_spectrum(to_spectrum(alpha, size)[:, :, :, None] * spectra[:, None], size, side)
+    return cast("Tensor", _LayOver.apply(seen, both.expand(len(seen), -1, -1, -1, -1, -1)))
 
 
 class _LayOver(torch.autograd.Function):
     """The layers over one another: blurred light (B, D, C, h, w), alpha and cumulative alpha (B, D, 2, C, h, w)."""
 
     @staticmethod
-    def forward(ctx: Any, light: Tensor, alphas: Tensor, lost: int) -> Tensor:
-        light, alphas = light[..., lost:, lost:], alphas[..., lost:, lost:]
+    def forward(ctx: Any, light: Tensor, alphas: Tensor) -> Tensor:
         alpha, cumulative = alphas.unbind(2)
         epsilon = EPSILON if cumulative.dtype == torch.float64 else EPSILON_FLOAT32
         scale = (cumulative.clamp(min=0) + epsilon).reciprocal()
@@ -103,13 +101,12 @@ class _LayOver(torch.autograd.Function):
         beyond = passed.flip(1).cumprod(1).flip(1)  # of this layer and all nearer ones
         shares = scale.clone()
         shares[:, :-1].mul_(beyond[:, 1:])
-        ctx.lost = lost
         ctx.save_for_backward(light, alpha, cumulative, scale, passed, shares)
         return (light * shares).sum(1)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
         light, alpha, cumulative, scale, passed, shares = ctx.saved_tensors
         seen, of_alphas = light * scale, light.new_zeros(*light.shape[:2], 2, *light.shape[2:])
         behind, of_scale = of_alphas.unbind(2)
@@ -118,4 +115,4 @@ class _LayOver(torch.autograd.Function):
         torch.addcmul(light, alpha, behind, value=-1, out=of_scale).mul_(scale).mul_(cumulative >= 0)
         of_light = shares * gradient[:, None]
         of_alphas.mul_(of_light.neg()[:, :, None])
-        return *(pad(own, (ctx.lost, 0, ctx.lost, 0)) for own in (of_light, of_alphas)), None
+        return of_light, of_alphas
