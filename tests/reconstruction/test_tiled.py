@@ -93,7 +93,7 @@ def seam(head, image, **options):
 
 class TestSeams(BaseTester):
     @pytest.mark.parametrize("name", ["plain", "corners"])
-    @settings(max_examples=12)
+    @settings(max_examples=8)
     @given(st.integers(1, 150), st.integers(1, 150), st.integers(0, 60), st.integers(0, 60))
     def test_property_any_size_and_tile(self, name, height, width, more, and_more):
         """In float64, tiles barely larger than their overlap and such that hold the image."""
