@@ -233,11 +233,18 @@ INLINE void compute_block(pixels p, int64_t n, int64_t end, int kind, int slope)
     if (n < end) compute_some(&p, n, end - n, kind, slope);
 }
 
-INLINE int compute(const pixels *p, int kind) {
+INLINE void compute_from(const pixels *p, int64_t n, int kind) {
+    const int64_t end = least(n + BLOCK, p->count);
+    if (p->gradient) compute_block(*p, n, end, kind, 1);
+    else compute_block(*p, n, end, kind, 0);
+}
+
+static int compute(const pixels *p, int kind) {
 #pragma omp parallel for num_threads(p->threads) if (p->count > 8 * BLOCK)
     for (int64_t n = 0; n < p->count; n += BLOCK) {
-        if (p->gradient) compute_block(*p, n, least(n + BLOCK, p->count), kind, 1);
-        else compute_block(*p, n, least(n + BLOCK, p->count), kind, 0);
+        if (kind == DECODE) compute_from(p, n, DECODE);
+        else if (kind == ENCODE) compute_from(p, n, ENCODE);
+        else compute_from(p, n, RECORD);
     }
     return 0;
 }
