@@ -28,7 +28,7 @@ from kornia_tidy.render.borders import cropped
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
-_UNIT = "unit of depth"
+DEPTH_UNIT = "unit of depth"
 
 
 @dataclass(eq=False)
@@ -334,12 +334,12 @@ def warn_of_defocus(depth: Tensor, camera: CheckedCamera, extremes: Tensor | Non
     lens, told = camera.psf_model.camera, camera.notes.told
     lo, hi = lens.defocus_range
     lowest, highest = (math.inf, -math.inf) if extremes is None else extremes.tolist()
-    if _UNIT in told:
+    if DEPTH_UNIT in told:
         return
     if not clamped or lowest > hi or highest < lo:
         said = misread_depth(lens, *(float(end) for end in torch.aminmax(depth.detach())))
         if said is not None:
-            warn_once(told, _UNIT, said, stacklevel=8)
+            warn_once(told, DEPTH_UNIT, said, stacklevel=8)
             return
     if clamped:
         warn_once(

@@ -19,6 +19,7 @@ from lightning.pytorch.utilities.warnings import PossibleUserWarning
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from kornia_tidy.camera.samples import DEPTH_UNIT
 from kornia_tidy.camera.saved_parts import below
 from kornia_tidy.files import error_prefix, only_here, output_folder
 from kornia_tidy.psf.field_bank import FieldBank
@@ -125,7 +126,7 @@ def train(
         design = stored is None and masks_from is None
         module = TidyTraining.from_settings(settings, psfs=psfs, design=design, progress=progress)
         if settings.data in PAINTED:
-            module.optics.notes.told.add("depth")  # painted in metres: a far scene does not suggest another unit
+            module.optics.notes.told.add(DEPTH_UNIT)  # painted in metres: a far scene does not suggest another unit
         if stored is None:
             _begin(module, settings.window, head_from, refiner_from, masks_from)
         elif settings.fixed_optics:  # the masks may have been designed
