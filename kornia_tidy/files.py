@@ -37,7 +37,7 @@ _ENCODINGS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-_HIDDEN = ("__macosx", "thumbs.db", "ehthumbs.db", "desktop.ini")  # besides names that begin with a dot
+_HIDDEN = ("__macosx", "@eadir", "thumbs.db", "ehthumbs.db", "desktop.ini")  # besides names that begin with a dot
 _LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
@@ -138,7 +138,8 @@ def find_files(root: str | os.PathLike[str], pattern: str) -> Iterator[Path]:
     Convention:
         Hidden files and those in hidden folders are passed by, as a shell's ``*`` does: names that begin with a dot,
         unless the pattern has the dot. macOS leaves ``._name`` beside each file on drives of other systems, and in the
-        folder ``__MACOSX`` of archives. That and what Windows hides, such as ``Thumbs.db``, are also ignored.
+        folder ``__MACOSX`` of archives. That, what Windows hides, such as ``Thumbs.db``, and the thumbnails that
+        network drives keep in ``@eaDir`` are also ignored.
     """
     dotted = [part for part in PurePath(pattern).parts if part.startswith(".")]
     for path in Path(root).glob(pattern):

@@ -42,8 +42,13 @@ def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
         values: Any = read_json(path)
         if not isinstance(values, dict) or not values or not set(values) <= set(OPTIONS):
             raise ValueError(f"cannot read {path}: a calibration holds some of {', '.join(OPTIONS)}, and nothing else")
+        if wrong := [name for name, value in values.items() if type(value) not in {int, float}]:
+            raise ValueError(f"cannot read {path}: {wrong[0]} must be a number, got {values[wrong[0]]!r:.40}")
     else:
-        entries = dict(_ENTRY.findall(read_text(path, "replace")))
+        found = _ENTRY.findall(read_text(path, "replace"))
+        entries = dict(found)
+        if len(entries) < len(found):
+            raise ValueError(f"cannot read {path}: it gives an entry twice: {', '.join(name for name, _ in found)}")
         camera = re.findall(r"[-+.\deE]+", entries.get("cam0", ""))
         if len(camera) != 9 or not {"baseline", "doffs"} <= set(entries):
             raise ValueError(

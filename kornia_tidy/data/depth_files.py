@@ -28,6 +28,7 @@ from kornia_tidy.optics.units import warn_once
 # Largest numbers of data types, which often mark unknown depth.
 UNKNOWN: dict[Any, float] = {np.dtype(kind): int(np.iinfo(kind).max) for kind in ("u2", "i2", "u4", "i4")}
 UNKNOWN |= {np.dtype(kind): float(np.finfo(kind).max) for kind in ("f2", "f4")}
+BASELINES = (1e-3, 10.0)  # m; a pair farther apart or nearer is rather given in another unit
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 
 
@@ -215,6 +216,14 @@ def check_depth_options(
     else:
         check_positive("focal_px", focal_px, "pixels")
         check_positive("baseline_m", baseline_m, "metres")
+        if not BASELINES[0] <= baseline_m <= BASELINES[1]:
+            factor = 0.001 if baseline_m > BASELINES[1] else 1000  # metres read as millimetres
+            warn_once(
+                None,
+                "baseline_m",
+                f"baseline_m is {baseline_m:g} m, and pairs of cameras are {BASELINES[0]:g} to {BASELINES[1]:g} m "
+                f"apart: if it is in another unit, multiply it, perhaps by {factor:g}",
+            )
         if not np.isfinite(doffs_px):
             raise ValueError(f"doffs_px must be finite pixels, got {doffs_px}")
 

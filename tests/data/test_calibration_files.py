@@ -32,7 +32,9 @@ class TestReadCalibration(BaseTester):
             ("calib.txt", TEXT.replace("53.271", "1e999"), "doffs_px must be positive and finite, got inf"),
             ("a.json", "[1]", "a calibration holds some of focal_px, baseline_m, doffs_px, scale"),
             ("a.json", '{"focal": 1}', "a calibration holds some of focal_px"),
-            ("a.json", '{"scale": "mm"}', "could not convert"),
+            ("calib.txt", TEXT + "\nbaseline=1\n", "it gives an entry twice: .*baseline, .*baseline"),
+            ("a.json", '{"scale": "0.001"}', "scale must be a number, got '0.001'"),
+            ("a.json", '{"scale": true}', "scale must be a number, got True"),
             ("a.json", '{"scale": 0}', "scale must be positive and finite, got 0"),
         ],
     )

@@ -36,7 +36,8 @@ def published(tmp_path_factory):
         beside = littered / path.relative_to(plain)
         beside.with_name(f"._{beside.name}").write_bytes(APPLE_DOUBLE)
         if path.is_dir():
-            for name in (".DS_Store", "Thumbs.db"):
+            for name in (".DS_Store", "Thumbs.db", "@eaDir/a.png"):
+                (beside / name).parent.mkdir(exist_ok=True)
                 (beside / name).write_bytes(b"\0\0\0\1Bud1")
     for root in [path for path in littered.iterdir() if path.is_dir()]:  # as an archive packed by macOS unpacks
         for path in [path for path in root.rglob("._*") if "__MACOSX" not in path.parts]:

@@ -30,6 +30,7 @@ from kornia_tidy.arrays import depth_tensor
 from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur, depth_blur
 from kornia_tidy.cli import main
 from kornia_tidy.data import read_depth, write_depth
+from kornia_tidy.data.depth_files import check_depth_options
 from kornia_tidy.data.pfm import encode_pfm
 from kornia_tidy.lab.calibration.psf import diffraction_cutoff
 from kornia_tidy.lab.mask_export import frame_times
@@ -149,6 +150,10 @@ class TestDepth(BaseTester):
             (lambda: GreyLevels(2, response=(0, 0.3, 0.6, 0.9)), "response spans 0.9 rad: multiply waves by 2 pi"),
             (lambda: PixelCrosstalk(8e-6), "sigma is 8e-06 pixels, as if none: divide metres by the pixel pitch"),
             (lambda: depth_blur(*scene(1e-3), 1.0, 2.0), "farthest pixel is 0.001 m away, .* kilometres"),
+            (
+                lambda: check_depth_options(kind="disparity", focal_px=1, baseline_m=193.5),
+                "baseline_m is 193.5 m, .* 0.001",
+            ),
             (lambda: full_well_of(8), "pixel_pitch must be metres between"),
         ],
     )

@@ -21,6 +21,9 @@ _UNITS = {
     "waves": r"(?<![a-z])(waves?|cycles?|turns?)(?![a-z])|(?<![0-9.])2 ?(pi|π)(?![a-z])|[(\[/] ?(λ|lambda) ?([)\]]|$)",
 }
 _PHASE = r"phase|phi(?![a-z])|φ|retard|modulation|shift"
+_OTHER_UNITS = re.compile(
+    rf"(?:{_PHASE})[^,;\t(\[]*[(\[] ?(nm|[uµμ]m|%|nanomet\w+|micromet\w+|percent|v|volts?) ?[)\]]"
+)
 _FORM = "a response has one phase for each grey level, or two columns, level and phase"
 
 _Row = tuple[int, tuple[float, ...]]
@@ -122,6 +125,10 @@ def _names_phases(text: str) -> bool:
 
 def _unit(path: str | os.PathLike[str], heading: str) -> str:
     """Return the unit of phases by their heading, radians if it has none."""
+    if other := _OTHER_UNITS.search(heading):
+        raise ValueError(
+            f"cannot read {path}: its header gives phases in {other[1]}, and read are radians, degrees, pi and waves"
+        )
     found = [unit for unit, words in _UNITS.items() if re.search(words, heading)]
     if found == ["radians", "pi"]:
         return "pi"  # "pi rad"

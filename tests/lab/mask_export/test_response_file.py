@@ -102,6 +102,13 @@ class TestReadResponse(BaseTester):
         (tmp_path / "lut.csv").write_text(text)
         assert read_response(tmp_path / "lut.csv", 8) == pytest.approx(PLAIN, abs=1e-4)
 
+    def test_exception_a_unit_that_is_not_read(self, tmp_path):
+        (tmp_path / "lut.csv").write_text("Level (%), Phase shift (nm)\n0,0\n1,1.5\n2,3\n3,4.5")
+        with pytest.raises(ValueError, match="header gives phases in nm, and read are radians"):
+            read_response(tmp_path / "lut.csv", 2)
+        (tmp_path / "lut.csv").write_text("Level (%), Phase shift (rad)\n0,0\n1,1.5\n2,3\n3,4.5")
+        assert read_response(tmp_path / "lut.csv", 2) == [0, 1.5, 3, 4.5]
+
     def test_feature_whole_degrees_behind_commas_are_a_column(self, tmp_path):
         (tmp_path / "lut.csv").write_text("level,phase deg\n0,0\n1,120\n2,240\n3,350\n")
         assert read_response(tmp_path / "lut.csv", 2) == pytest.approx(np.radians([0, 120, 240, 350]))
