@@ -303,7 +303,8 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     notes = []
     level = float(middle.mean())
     found = noise.std(level)
-    repaired = repair_outliers(light, noise)
+    most = noise if told is None else MeasuredNoise(*map(max, noise, told))  # JPEG shows less than the sensor's
+    repaired = repair_outliers(light, most)
     if repaired.count:
         notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced by their neighbours' median")
     even = repair_bands(repaired.light, found)
