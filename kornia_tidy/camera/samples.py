@@ -28,7 +28,7 @@ from kornia_tidy.render.borders import cropped
 # Peak memory of a capture in float32 beyond image and capture: for tiles, and for each value of the image.
 BYTES_OF_TILES, BYTES_A_VALUE = 24 << 20, 40
 ROUNDING = 5e-4  # radians beyond the camera's range that are not counted as beyond
-DEPTH_UNIT = "unit of depth"
+DEPTH_UNIT, _RANGE = "unit of depth", "depths beyond the camera's range"  # keys of warnings
 
 
 @dataclass(eq=False)
@@ -334,17 +334,15 @@ def warn_of_defocus(depth: Tensor, camera: CheckedCamera, extremes: Tensor | Non
     lens, told = camera.psf_model.camera, camera.notes.told
     lo, hi = lens.defocus_range
     lowest, highest = (math.inf, -math.inf) if extremes is None else extremes.tolist()
-    if DEPTH_UNIT in told:
-        return
-    if not clamped or lowest > hi or highest < lo:
+    if DEPTH_UNIT not in told and (not clamped or lowest > hi or highest < lo):
         said = misread_depth(lens, *(float(end) for end in torch.aminmax(depth.detach())))
         if said is not None:
             warn_once(told, DEPTH_UNIT, said, stacklevel=8)
-            return
+            told.add(_RANGE)  # which such depths are beyond
     if clamped:
         warn_once(
             told,
-            "depths beyond the camera's range",
+            _RANGE,
             f"{clamped} of {depth.numel()} pixels have a defocus between {lowest:+.2f} and {highest:+.2f} rad, beyond "
             f"the camera's range {lo:+.2f} to {hi:+.2f}: they are rendered as its ends (see "
             f"ThinLensCamera.for_scene, or its depth_range)",

@@ -28,6 +28,7 @@ from kornia_tidy import (
 )
 from kornia_tidy.arrays import depth_tensor
 from kornia_tidy.augmentation import LinearCamera, RandomDepthBlur, depth_blur
+from kornia_tidy.camera.samples import DEPTH_UNIT
 from kornia_tidy.cli import main
 from kornia_tidy.data import read_depth, write_depth
 from kornia_tidy.data.depth_files import check_depth_options
@@ -83,6 +84,12 @@ class TestDepth(BaseTester):
             optics(image, depth)
         assert len(told) == 1
         optics(image, depth)
+
+    def test_feature_a_range_is_told_where_the_unit_is_known(self):
+        optics = camera()
+        optics.notes.told.add(DEPTH_UNIT)  # as for painted scenes in training
+        with pytest.warns(UserWarning, match="beyond the camera's range"):
+            optics(*scene(1e-3))
 
     def test_feature_all_beyond_a_camera_s_range_are_told_by_their_unit(self):
         optics = camera(camera=ThinLensCamera.for_scene((0.5, 4.0)))
