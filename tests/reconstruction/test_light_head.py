@@ -16,7 +16,7 @@ import kornia_tidy
 from kornia_tidy import SensorNoise, ThinLensCamera
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.reconstruction.camera_system import any_camera_system
-from kornia_tidy.reconstruction.capture_checks import check_capture
+from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import LightHead, UncertainReconstruction, reconstruct_light, with_noise_of
 from kornia_tidy.reconstruction.settings import SystemSettings
@@ -132,7 +132,8 @@ class TestReconstructLight(BaseTester):
         seen = []
         light_head = LightHead(TrainedSystem(optics, head, settings, 0))
         found = reconstruct_light(light_head, light, memory_budget=2 << 20, progress=lambda *n: seen.append(n))
-        light = check_capture(light).light  # without outliers
+        told = MeasuredNoise(*head.closed_form.noise_model.tolist())
+        light = check_capture(light, told).light  # without outliers
         whole = head(optics.encode(light[None]))[0]
         assert len(seen) > 1
         # Roundings of float32, times the slope of sRGB in the dark, 12.92, and the filter's largest gain, 5.
