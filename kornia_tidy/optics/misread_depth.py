@@ -43,9 +43,13 @@ def misread_depth(camera: ThinLensCamera | DefocusRange, nearest: float, farthes
         which, away, units = "farthest", farthest, (KILOMETRES,)
     else:
         return None
-    factor, unit = next((unit for unit in units if first / 4 <= away * unit[0] <= last), (0.0, ""))
-    remedies = [f"are these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"]
-    remedies = remedies[not unit :] + ["give a sky as infinity"] * sky
+    likely = [unit for unit in units if first / 4 <= away * unit[0] <= last]
+    remedies = [
+        f"are these {unit}? Multiply depth by {factor:g} (on the command line: --depth-scale {factor:g})"
+        for factor, unit in likely[:1]
+    ]
+    if sky:
+        remedies.append("give a sky as infinity")
     if not remedies:
         return None
     return f"the {which} pixel is {away:.4g} m away, far from the camera's focus: {'; '.join(remedies)}"
