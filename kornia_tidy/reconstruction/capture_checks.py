@@ -287,7 +287,8 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
 
     Args:
         light: (C, H, W) linear light.
-        told: the stated noise, with which the capture will be restored. None: nothing is compared.
+        told: the stated noise, with which the capture will be restored. Outliers exceed both it and the measured one.
+            None: nothing is compared.
 
     Example:
         >>> light = 0.5 + 0.01 * torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0))
