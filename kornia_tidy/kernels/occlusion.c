@@ -22,8 +22,9 @@
 #include "vectors.h"
 #include "field.h"
 
-enum { BAND = 8, WIDTH = 2 * LANES, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
+enum { BAND = 8, DOUBLES = VECTOR_BYTES / sizeof(double), PARTS = LANES / DOUBLES };
 enum { STRIPS = REGISTERS / 16, EDGE_ROWS = REGISTERS / 4 };  // whose sums stay in registers
+enum { WIDTH = STRIPS * LANES };  // of a block with a single layer in its window
 
 typedef double dvec __attribute__((vector_size(VECTOR_BYTES)));
 typedef double dloose __attribute__((vector_size(VECTOR_BYTES), aligned(8), may_alias));
@@ -245,7 +246,7 @@ static void draw_outline(const scene_parameters *s, workspace *d, int64_t x, int
 
 // Adds the products of two rows of light with a PSF: row `a` for the block's rows up to `split`, and row `b`, a PSF's
 // height below it, for the others.
-INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, int split, int strips, vec sums[2][BAND]) {
+INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, int split, int strips, vec sums[STRIPS][BAND]) {
     int64_t from = least(a->from, b->from), to = a->to > b->to ? a->to : b->to;
     for (int64_t j = from; j < to; j++)
 #pragma GCC unroll 2
@@ -259,7 +260,7 @@ INLINE void add_rays(const ray *a, const ray *b, const REAL *psf, int64_t side, 
 
 // Convolves rows of light with a PSF. `side` is at least BAND - 1.
 INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int strips, vec (*total)[BAND]) {
-    vec sums[2][BAND];
+    vec sums[STRIPS][BAND];
     memset(sums, 0, sizeof sums);
 #pragma GCC unroll 7
     for (int r = 0; r < BAND - 1; r++) add_rays(rays + r, rays + r + side, psf + r, side, r, strips, sums);
@@ -270,17 +271,6 @@ INLINE void convolve_rays(const ray *rays, const REAL *psf, int64_t side, int st
 
 static void convolve_one(const ray *rays, const REAL *psf, int64_t side, vec (*total)[BAND]) {
     convolve_rays(rays, psf, side, 1, total);
-}
-
-static void convolve_two(const ray *rays, const REAL *psf, int64_t side, vec (*total)[BAND]) {
-    convolve_rays(rays, psf, side, 2, total);
-}
-
-// Convolves two strips one after the other.
-INLINE void convolve_each(ray *rays, int64_t rows, const REAL *psf, int64_t side, vec (*total)[BAND]) {
-    convolve_one(rays, psf, side, total);
-    for (int64_t r = 0; r < rows; r++) rays[r].light += LANES;
-    convolve_one(rays, psf, side, total + 1);
 }
 
 // Adds the blur of weights 1: the sum over the starts and ends of runs of sign times the table's partial sum.
@@ -375,31 +365,21 @@ INLINE vec factor(const scene_parameters *s, const block *b, int order, int v) {
     return all(order == ALONG_Y ? (REAL)(b->rows.at + v) - s->over.row_middles[b->rows.tile] : 1);
 }
 
-// Renders a block of two strips with a single layer in its window: ((1 - veil) L + veil mean A) / A.
+// Renders a block of some strips with a single layer in its window: ((1 - veil) L + veil mean A) / A.
 static void lay_alone(const scene_parameters *s, workspace *d, const double *tables, int64_t image, span lines, int64_t x) {
-    const int64_t y = lines.at;
-    int32_t layer = d->heads[0]->layer;
-    int64_t area = s->side * s->side, rows = s->side + BAND - 1;
+    const int64_t y = lines.at, layer = d->heads[0]->layer, area = s->side * s->side;
     for (int64_t c = 0; c < s->channels; c++) {
         REAL *out = s->out + ((image * s->channels + c) * s->height + y) * s->width + x;
-        REAL whole = 0;
-        vec light[2][BAND];
-        memset(light, 0, sizeof light);
-        if (layer < s->layers) {
-            whole = tables[(layer * s->channels + c) * table_size(s) + table_rows(s) * (table_pitch(s) + 1) - 1];
-            for (int64_t r = 0; r < rows; r++) {
-                const REAL *row = s->plane + image * s->plane_image + c * s->plane_channel + (y + r) * s->plane_row + x;
-                d->rays[r] = (ray){row, 0, s->side};
-            }
-            const REAL *psf = s->psfs + (layer * s->channels + c) * area;
-            if (STRIPS == 2) convolve_two(d->rays, psf, s->side, light);
-            else convolve_each(d->rays, rows, psf, s->side, light);
-        }
-        REAL veil = s->veil && layer < s->layers ? s->veil[layer * s->channels + c] : 0;
+        const REAL *plane = s->plane + image * s->plane_image + c * s->plane_channel + y * s->plane_row + x;
+        for (int64_t r = 0; r < s->side + BAND - 1; r++) d->rays[r] = (ray){plane + r * s->plane_row, 0, s->side};
+        vec light[STRIPS][BAND];
+        convolve_rays(d->rays, s->psfs + (layer * s->channels + c) * area, s->side, STRIPS, light);
+        REAL whole = tables[(layer * s->channels + c) * table_size(s) + table_rows(s) * (table_pitch(s) + 1) - 1];
+        REAL veil = s->veil ? s->veil[layer * s->channels + c] : 0;
         REAL glow = s->veil ? veil * s->mean[image * s->channels + c] * whole : 0;
         REAL divisor = (whole > 0 ? whole : 0) + EPSILON;
         for (int v = lines.from - y; v < BAND; v++)
-            for (int strip = 0; strip < 2; strip++)
+            for (int strip = 0; strip < STRIPS; strip++)
                 *(loose *)(out + v * s->width + strip * LANES) = ((1 - veil) * light[strip][v] + glow) / divisor;
     }
 }
@@ -506,7 +486,7 @@ static void lay_over(const scene_parameters *s, workspace *d, const double *tabl
 }
 
 // Counts of operations for the cost of a scene, see `count_operations` in occlusion_ops.py.
-enum { ALONE, PAIRS, COLUMNS, EDGES, COUNTS };
+enum { PAIRS, COLUMNS, EDGES, COUNTS };
 
 static int64_t count_columns(const ray *rays, int64_t side) {
     int64_t columns = 0;
@@ -587,13 +567,13 @@ static void lay_band(const scene_parameters *s, workspace *d, const double *tabl
     const span rows = begin_band(s, d, image, n % bands_of(s));
     for (span x = {0}; x.to < s->width;) {
         x = next_block(s, x);
-        const int wide = !s->over.node_rows && x.at + WIDTH <= s->width && move_heads(d, height, x.at, s->side + WIDTH - 1);
-        if (!wide) move_heads(d, height, x.at, 0);
-        if (counts && wide) counts[ALONE]++;
+        int alone = move_heads(d, height, x.at, s->side + WIDTH - 1) && d->heads[0]->layer < s->layers;
+        alone &= !s->over.node_rows && x.at + WIDTH <= s->width;
+        if (counts && alone) counts[PAIRS]++, counts[COLUMNS] += STRIPS * s->side * s->side;
         else if (counts) count_block(s, d, x.at, counts);
-        else if (wide) lay_alone(s, d, tables, image, rows, x.at);
+        else if (alone) lay_alone(s, d, tables, image, rows, x.at);
         else lay_over(s, d, tables, image, rows, x);
-        if (wide) x.to += LANES;
+        if (alone) x.to += WIDTH - LANES;
     }
 }
 

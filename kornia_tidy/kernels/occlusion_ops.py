@@ -146,11 +146,11 @@ def count_operations(
     """
     plane = psfs.new_empty(()).expand(batch, 1, *layer_index.shape[1:])
     scene = _fields(plane, psfs[:, :1], layer_index, layer_weight)
-    every, counts = max(1, batch * output_of(plane, psfs)[2] // (BLOCK_ROWS * bands)), torch.zeros(4, dtype=torch.int64)
-    library, side = load(SOURCE, psfs.dtype), max(SMALLEST_SIDE, psfs.shape[-1])
+    every, counts = max(1, batch * output_of(plane, psfs)[2] // (BLOCK_ROWS * bands)), torch.zeros(3, dtype=torch.int64)
+    library = load(SOURCE, psfs.dtype)
     call(library.count, *scene, *(None,) * 8, counts, every)
-    alone, pairs, columns, ends = counts.tolist()  # blocks of one layer, pairs of another block and a layer, ...
-    of_pixel = alone * (2 * side**2 + _BLOCK) + pairs * _BLOCK + columns * _COLUMN + ends * _END
+    pairs, columns, ends = counts.tolist()  # pairs of a block and a layer, ...
+    of_pixel = pairs * _BLOCK + columns * _COLUMN + ends * _END
     return float(every * BLOCK_ROWS * vector_bytes(library) // psfs.itemsize * of_pixel)
 
 
