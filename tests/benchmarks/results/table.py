@@ -12,7 +12,6 @@ from tests.benchmarks.results.measure import NO_CAMERA, is_whole
 from tests.benchmarks.results.restorations import NETWORK
 from tests.benchmarks.results.scenes import SceneSet
 from tests.benchmarks.results.store import Measured, SystemRow
-from tests.benchmarks.standard_error import standard_error
 
 ByScene = dict[str, dict[str, float]]
 
@@ -57,8 +56,9 @@ def paired(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Difference
     differences = [value for value in differences if math.isfinite(value)]
     if not differences:
         return Difference(math.nan, math.nan, 0, 0)
-    ahead = sum(value > 0 for value in differences)
-    return Difference(statistics.fmean(differences), standard_error(differences), ahead, len(differences))
+    count, ahead = len(differences), sum(value > 0 for value in differences)
+    error = statistics.stdev(differences) / math.sqrt(count) if count > 1 else math.nan
+    return Difference(statistics.fmean(differences), error, ahead, count)
 
 
 class Results:
