@@ -29,10 +29,9 @@ from kornia_tidy.psf.field import Field
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_cache import nodes_around
 from kornia_tidy.render.backend import wants_gradient
-from kornia_tidy.render.backends.dense_occlusion import cumulative_weight, lay_over
-from kornia_tidy.render.borders import check_border, cropped, from_spectrum, pad_border, to_spectrum
+from kornia_tidy.render.backends.dense_occlusion import occlude_dense
+from kornia_tidy.render.borders import check_border, cropped, pad_border
 from kornia_tidy.render.dispatch import BACKENDS, Rendering, render_layers
-from kornia_tidy.render.layers import present_layers, weight_of_layer
 from kornia_tidy.render.scene import assign_layers, layered_scene
 from kornia_tidy.render.stray_light import spread_evenly
 
@@ -69,10 +68,11 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
             "stray_light 'veil' cannot be spread behind things that hide where PSFs vary over the picture: take a "
             "fidelity with stray_light='renormalize' or 'discard', or compositing 'gather' or 'scatter'"
         )
+    if occludes:  # which divides by the PSFs' light
+        bank = bank.with_all_light()
     alike, tiled = field.nodes == (1, 1) and not occludes, None
     if alike or _is_compiled(light, defocus, bank, field, rendering):
-        psfs = bank.with_all_light().psfs if occludes else bank.psfs  # which it divides by
-        given = light, defocus, bank.defocus, psfs[0] if alike else psfs, None
+        given = light, defocus, bank.defocus, bank.psfs[0] if alike else bank.psfs, None
         whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus))))
         with torch.set_grad_enabled(whole and torch.is_grad_enabled()):
             tiled = render_layers(*given, rendering, field=None if alike else field)
@@ -84,7 +84,7 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
         deep = pad_border(defocus, radius, "replicate" if border == "zero" else border)
         around = field.moved(-radius, -radius)
     if occludes and border == "zero":
-        inside = pad_border(torch.ones_like(light[:1, :1]), radius, "zero")
+        inside = pad_border(torch.ones_like(light[:1, 0]), radius, "zero")
     cells = _Cells(bank, around, rendering)
     seen = cells.scatter(plane, deep) if rendering.compositing == "scatter" else cells.see(plane, deep, inside)
     if tiled is not None:
@@ -138,7 +138,6 @@ class _Cells:
         self.field, self.rendering, self.bank = field, rendering, bank
         self.nodes, self.radius = tuple(bank.defocus.tolist()), bank.window // 2
         self.psfs = bank.psfs.movedim(1, 0).contiguous()  # (D, F, C, P, P)
-        self.light = bank.light.movedim(1, 0)  # (D, F, C)
 
     def _columns(self, deep: Tensor, margin: int) -> list[tuple[_Steps, Tensor]]:
         """Return the cells along a row, and how value and slopes there follow from those at its nodes, (3, 2 nx)."""
@@ -159,14 +158,17 @@ class _Cells:
                 around = ..., _wider(down.pixels, radius), _wider(across.pixels, radius)
                 window, depths = plane[around], deep[around]
                 own = self._layers(cropped(depths, radius) if self.rendering.compositing == "gather" else depths)
+                psfs, factors = self._psfs(line, mixing, own), _factors(down, across)
                 if self.rendering.compositing == "gather":
-                    psfs = self._psfs(line, mixing, own).flatten(1, 2)
-                    seen = self._rendered(window.repeat(1, 3, 1, 1), depths, own, psfs, "valid")
-                    parts.append(_blended(seen.unflatten(1, (3, -1)), down, across))
+                    seen = self._rendered(window.repeat(1, 3, 1, 1), depths, own, psfs.flatten(1, 2), "valid")
+                    seen = (seen.unflatten(1, (3, -1)) * factors[:, None]).sum(1)
                 else:
+                    index, weight = assign_layers(depths[:, 0], self.bank.defocus[own], self.rendering.layers)
+                    shown = None if self.rendering.layers == "nearest" else weight
+                    psfs = (psfs.flip((-2, -1)) if self.rendering.correlate else psfs).transpose(0, 1)
                     dark = None if inside is None else inside[around]
-                    psfs, light = self._psfs(line, mixing, own), self._light(down, mixing, own)
-                    parts.append(self._occluded(window, depths, dark, own, psfs, light, down, across))
+                    seen = occlude_dense(window, psfs, shown, None, None, index, dark, factors).to(window.dtype)
+                parts.append(seen)
             lines.append(torch.cat(parts, -1))
         return torch.cat(lines, -2)
 
@@ -180,43 +182,11 @@ class _Cells:
                 window, depths = (x[..., down.pixels, across.pixels] for x in (plane, deep))
                 own = self._layers(depths)
                 psfs = self._psfs(line, mixing, own).flatten(1, 2)
-                parts = torch.cat([window, down.offset[:, None] * window, across.offset * window], 1)
+                parts = (window[:, None] * _factors(down, across)[:, None]).flatten(1, 2)
                 parts, depths = pad(parts, (radius,) * 4), pad(depths, (radius,) * 4, mode="replicate")
                 spread = self._rendered(parts, depths, own, psfs, "zero").unflatten(1, (3, -1)).sum(1)
                 total[..., _wider(down.pixels, radius), _wider(across.pixels, radius)] += spread
         return cropped(total, 2 * radius)
-
-    def _occluded(
-        self,
-        window: Tensor,
-        depths: Tensor,
-        inside: Tensor | None,
-        own: slice,
-        psfs: Tensor,
-        light: Tensor,
-        down: _Steps,
-        across: _Steps,
-    ) -> Tensor:
-        """Return the pixels of a cell for layers that hide one another, see :func:`lay_over`."""
-        index, weight = assign_layers(depths, self.bank.defocus[own], self.rendering.layers)
-        shown = None if self.rendering.layers == "nearest" else weight.double()
-        psfs = (psfs.flip((-2, -1)) if self.rendering.correlate else psfs).double()  # (D, 3, C, P, P)
-        lit = _blended(light[..., None, None], down, across)  # (D, C, h, w)
-        size, side = (window.shape[-2], window.shape[-1]), psfs.shape[-1]
-
-        def blur(planes: Tensor, spectrum: Tensor) -> Tensor:
-            planes = planes if inside is None else planes * inside
-            blurred = from_spectrum(to_spectrum(planes, size)[:, None] * spectrum, size, side)
-            return _blended(blurred, down, across)
-
-        def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-            for layer in reversed(present_layers(index, shown, len(psfs))):
-                spectrum = to_spectrum(psfs[layer], size)
-                held = weight_of_layer(index, shown, layer).double()
-                behind = cumulative_weight(index, shown, layer).double()
-                yield blur(held * window, spectrum) * lit[layer], blur(held, spectrum), blur(behind, spectrum)
-
-        return lay_over(near_to_far()).to(window.dtype)
 
     def _rendered(self, light: Tensor, depths: Tensor, own: slice, psfs: Tensor, border: str) -> Tensor:
         return render_layers(light, depths, self.bank.defocus[own], psfs, None, replace(self.rendering, border=border))
@@ -235,12 +205,6 @@ class _Cells:
         first, rows = line
         part = rows[own.start - first : own.stop - first]
         return (mixing @ part).unflatten(2, self.psfs.shape[2:])
-
-    def _light(self, down: _Steps, mixing: Tensor, own: slice) -> Tensor:
-        """Return value and slopes of the relative illumination of a cell, (D, 3, C)."""
-        weights = down.weights.to(self.light)
-        rows = weights @ self.light[own].unflatten(1, self.field.nodes).flatten(2)
-        return mixing @ rows.unflatten(2, (self.field.nodes[1], -1)).flatten(1, 2)
 
     def _steps(self, axis: int, deep: Tensor, margin: int) -> Iterator[_Steps]:
         """Yield the cells along an axis. They stand at the same places of the picture whatever part of it is seen."""
@@ -261,7 +225,7 @@ def _wider(pixels: slice, radius: int) -> slice:
     return slice(pixels.start, pixels.stop + 2 * radius)
 
 
-def _blended(parts: Tensor, down: _Steps, across: _Steps) -> Tensor:
-    """Return a value with its two slopes, (N, 3, C, h, w) or (N, 3, C, 1, 1), at each pixel of a cell: (N, C, h, w)."""
-    value, along_rows, along_columns = parts.unbind(1)
-    return value + down.offset[:, None] * along_rows + across.offset * along_columns
+def _factors(down: _Steps, across: _Steps) -> Tensor:
+    """Return what value and slopes of the PSFs are multiplied by at each pixel of a cell, (3, h, w): 1, y and x."""
+    y, x = torch.meshgrid(down.offset, across.offset, indexing="ij")
+    return torch.stack([torch.ones_like(y), y, x])

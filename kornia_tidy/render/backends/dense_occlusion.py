@@ -23,6 +23,7 @@ from kornia_tidy.render.scene import LayeredScene
 from kornia_tidy.render.stray_light import normalised_share
 
 EPSILON = 1e-6  # added to the divisor: white stays white to this, over the share of the PSF that a layer is seen by
+_NODES = 4  # of a field at a time: planes are blurred by the PSF of each
 
 
 def lay_over(layers: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
@@ -134,21 +135,19 @@ def occlude_dense(
     nodes = psfs[None] if shares is None else psfs
     size, side = (light.shape[-2], light.shape[-1]), psfs.shape[-1]
 
-    def blended(of_nodes: Iterable[Tensor]) -> Tensor:
-        if shares is None:
-            return next(iter(of_nodes))
-        total = torch.zeros((), dtype=light.dtype, device=light.device)
-        for share, own in zip(shares.to(light), of_nodes, strict=True):
-            total = total + share * own
-        return total
-
-    def blur(plane: Tensor, spectra: list[Tensor]) -> Tensor:
+    def blur(plane: Tensor, spectra: Tensor) -> Tensor:
         own = to_spectrum(plane if inside is None else plane * inside[:, None], size)
-        return blended(from_spectrum(own * spectrum, size, side) for spectrum in spectra)
+        if shares is None:
+            return from_spectrum(own * spectra[0], size, side)
+        total = torch.zeros((), dtype=light.dtype, device=light.device)
+        for some, share in zip(spectra.split(_NODES), shares.to(light).split(_NODES), strict=True):
+            blurred = from_spectrum(own * some[:, None], size, side)
+            total = total + (share[:, None, None] * blurred).sum(0)
+        return total
 
     def near_to_far() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         for layer in reversed(present_layers(index, weight, nodes.shape[1])):
-            spectra = [to_spectrum(psf, size) for psf in nodes[:, layer]]
+            spectra = to_spectrum(nodes[:, layer], size)
             own = weight_of_layer(index, weight, layer).double()
             cumulative = cumulative_weight(index, weight, layer).double()
             lit = light
@@ -156,7 +155,7 @@ def occlude_dense(
                 lit = torch.lerp(light, mean.double()[..., None, None], stray_light[layer, :, None, None].double())
             seen = blur(own * lit, spectra)
             if shares is not None:
-                seen = seen * blended(nodes[:, layer].sum((-2, -1))[..., None, None])
+                seen = seen * torch.einsum("fhw,fc->chw", shares.to(light), nodes[:, layer].sum((-2, -1)))
             yield seen, blur(own, spectra), blur(cumulative, spectra)
 
     return lay_over(near_to_far())
