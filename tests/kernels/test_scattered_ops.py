@@ -93,12 +93,7 @@ class TestScatteredLight(OperatorTester):
             (11, lambda x: x.float(), TypeError, "columns must be"),
             (3, lambda x: x.float(), TypeError, "values must be torch.float64, got torch.float32"),
             (2, lambda x: x.int(), TypeError, "cell must be torch.int64, got torch.int32"),
-            (
-                7,
-                lambda x: x[:0],
-                ValueError,
-                "kernel and its width must be at least 1, got 0 coefficients and width",
-            ),
+            (7, lambda x: x[:0], ValueError, "kernel and its width must be at least 1, got 0 coefficients and width"),
             (1, lambda x: x.repeat(2), ValueError, r"weights must have shape \(\d+\), got"),
             (3, lambda x: x[:, 1:], ValueError, r"values must have shape \(\d+, \d+, \d+, S\), got"),
             (9, lambda x: x[1:], ValueError, r"sines must have shape \(\d+, \d+\), got"),
