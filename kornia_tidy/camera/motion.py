@@ -8,10 +8,12 @@ from typing import Any
 import torch
 from kornia.geometry import remap
 from torch import Tensor
+from torch.nn.functional import pad
 
 from kornia_tidy.camera.samples import check_light, compute_dtype, read_sample
 from kornia_tidy.camera.tidy_optics import TiDyOptics
 from kornia_tidy.checks import check_float_tensor, check_part
+from kornia_tidy.optics.units import check_depth_fits
 
 
 def moving_capture(
@@ -124,7 +126,7 @@ def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> 
 
     Args:
         image: (B, C, H, W).
-        depth: (B, 1, H, W).
+        depth: (B, 1, H, W) or (1, 1, H, W).
         homographies: (M, 3, 3) or (B, M, 3, 3): from pixels (x, y, 1) of the image to where they are at each moment.
 
     Returns:
@@ -146,12 +148,10 @@ def scenes_by_homography(image: Tensor, depth: Tensor, homographies: Tensor) -> 
         tensor([[[0., 1., 2., 3.],
                  [0., 0., 1., 2.]]])
     """
-    _check_scene(image, depth)
+    pixels = _pixels(image, depth)
     if homographies.ndim not in (3, 4) or tuple(homographies.shape[-2:]) != (3, 3):
         raise ValueError(f"homographies must have shape (M, 3, 3) or (B, M, 3, 3), got {tuple(homographies.shape)}")
-    height, width = image.shape[-2:]
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    there = torch.stack([x, y, torch.ones_like(x)], -1).to(homographies)
+    there = pad(pixels, (0, 1), value=1).to(homographies)
     back = torch.linalg.inv(homographies)
     came = (back[..., None, None, :, :] @ there[..., None])[..., 0]
     return _warped(image, depth, came[..., :2] / came[..., 2:])
@@ -162,7 +162,7 @@ def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor,
 
     Args:
         image: (B, C, H, W).
-        depth: (B, 1, H, W).
+        depth: (B, 1, H, W) or (1, 1, H, W).
         flows: (M, 2, H, W) or (B, M, 2, H, W), pixels (x, y): the motion since the image of the point at a pixel *at
             the moment*; a point seen at p then was at p - flow(p) in the image.
 
@@ -181,23 +181,21 @@ def scenes_by_flow(image: Tensor, depth: Tensor, flows: Tensor) -> tuple[Tensor,
         >>> scenes_by_flow(torch.arange(4.0).view(1, 1, 1, 4), torch.ones(1, 1, 1, 4), flow)[0].flatten()
         tensor([0., 0., 1., 2.])
     """
-    _check_scene(image, depth)
-    height, width = image.shape[-2:]
+    pixels, (height, width) = _pixels(image, depth), image.shape[-2:]
     if flows.ndim not in (4, 5) or tuple(flows.shape[-3:]) != (2, height, width):
         raise ValueError(
             f"flows must have shape (M, 2, {height}, {width}) or (B, M, 2, {height}, {width}), got {tuple(flows.shape)}"
         )
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return _warped(image, depth, torch.stack([x, y], -1).to(flows) - flows.movedim(-3, -1))
+    return _warped(image, depth, pixels.to(flows) - flows.movedim(-3, -1))
 
 
-def _check_scene(image: Tensor, depth: Tensor) -> None:
+def _pixels(image: Tensor, depth: Tensor) -> Tensor:
+    """Return the pixels (x, y) of a scene, (H, W, 2), or raise ``TypeError`` or ``ValueError`` unless its parts fit."""
     check_float_tensor("image", image, 4, "(B, C, H, W)")
     check_float_tensor("depth", depth, 4, "(B, 1, H, W)")
-    if depth.shape[1] != 1 or depth.shape[0] != image.shape[0] or depth.shape[-2:] != image.shape[-2:]:
-        raise ValueError(
-            f"depth must have shape {(image.shape[0], 1, *image.shape[-2:])} to fit the image, got {tuple(depth.shape)}"
-        )
+    check_depth_fits(depth, image)
+    y, x = torch.meshgrid(*map(torch.arange, image.shape[-2:]), indexing="ij")
+    return torch.stack([x, y], -1)
 
 
 def _warped(image: Tensor, depth: Tensor, came: Tensor) -> tuple[Tensor, Tensor]:
@@ -215,4 +213,4 @@ def _warped(image: Tensor, depth: Tensor, came: Tensor) -> tuple[Tensor, Tensor]
         moved = remap(repeated, x, y, mode, "border", align_corners=True)
         return moved.unflatten(0, (batch, moments)).to(plane.dtype)
 
-    return taken(image, "bilinear"), taken(depth, "nearest")
+    return taken(image, "bilinear"), taken(depth.expand(batch, -1, -1, -1), "nearest")

@@ -196,7 +196,7 @@ class TestScenes(BaseTester):
         with pytest.raises(ValueError, match=sentence):
             make(image, depth, motion)
         with pytest.raises(ValueError, match=r"depth must have shape \(2, 1, 26, 22\) to fit the image"):
-            make(image, depth[:1], motion)
+            make(image, depth.mT, motion)
         with pytest.raises(ValueError, match=r"image must have shape \(B, C, H, W\)"):
             make(image[0], depth, motion)
 
@@ -208,6 +208,13 @@ class TestScenes(BaseTester):
             assert (images.shape, depths.shape) == ((2, 3, 3, 26, 22), (2, 3, 1, 26, 22))
             assert images.dtype == depths.dtype == dtype
         assert scenes_by_homography(image, depth, moves.repeat(2, 1, 1, 1))[0].shape == (2, 3, 3, 26, 22)
+
+    def test_feature_one_depth_is_that_of_all_images(self):
+        image, depth = scene()
+        shift, repeated = shifts([(1, 2)]), depth[:1].expand(2, -1, -1, -1)
+        found, expected = scenes_by_homography(image, depth[:1], shift), scenes_by_homography(image, repeated, shift)
+        for one, each in zip(found, expected, strict=True):
+            assert torch.equal(one, each)
 
     def test_feature_a_homography_against_scipy(self):
         image, depth = scene(batch=1, channels=1)
