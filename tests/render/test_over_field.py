@@ -122,6 +122,20 @@ class TestRenderOverField(BaseTester):
         cells = render_over_field(light, defocus, bank, field, Rendering(compositing, border))
         self.assert_close(tiles, cells, rtol=0, atol=1e-12)
 
+    @pytest.mark.parametrize("border", ["reflect", "valid", "zero"])
+    def test_feature_cells_of_torch_see_the_same_behind_what_hides(self, border, monkeypatch):
+        """Also where windows hold other shares of the light at each node."""
+        field = Field(SIZE, (2, 2), cell=32)
+        (light, defocus), bank = scene_of(), bank_over(field)
+        psfs = _without_product(bank.psfs)
+        psfs = psfs - psfs.min() + 1e-3
+        held = torch.tensor([0.9, 0.7, 1.0, 0.8], dtype=torch.float64).view(4, 1, 1, 1, 1)
+        bank = replace(bank, psfs=held * psfs, light=psfs.sum((-2, -1)))
+        tiles = render_over_field(light, defocus, bank, field, Rendering("occlusion", border))
+        monkeypatch.setattr(over_field, "_is_compiled", lambda *_: False)
+        cells = render_over_field(light, defocus, bank, field, Rendering("occlusion", border))
+        self.assert_close(tiles, cells, rtol=0, atol=1e-6)
+
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_feature_parts_of_a_picture_are_those_of_the_whole(self, compositing):
         field = Field(SIZE, (3, 2), cell=25)
