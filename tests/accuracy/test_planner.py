@@ -253,7 +253,7 @@ class TestPlan(BaseTester):
         flat.masks.phase.grad = None
 
     def test_feature_states_are_rendered_one_by_one_where_layers_hide_others(self):
-        optics = TiDyOptics(PixelwiseMask(3, 15), sensor=None)
+        optics = TiDyOptics(PixelwiseMask(3, 15, initial="flat"), sensor=None)
         hiding = TiDyOptics(optics.masks, sensor=None, compositing="occlusion")
         depth = torch.linspace(0.4, 3, 60 * 72).view(1, 60, 72)
         plan, other = (each.plan(depth, tolerance=1e-2) for each in (hiding, optics))
@@ -275,7 +275,7 @@ class TestPlan(BaseTester):
         assert optics.plan(turned, tolerance=1e-2) == optics.plan(depth, tolerance=1e-2)
 
     def test_feature_a_paper_camera_can_be_planned_exactly(self):
-        paper = TiDyOptics(PixelwiseMask(1), DefocusRange(-10, 10), sensor=None, fidelity="paper")
+        paper = TiDyOptics(PixelwiseMask(1, initial="flat"), DefocusRange(-10, 10), sensor=None, fidelity="paper")
         plan = paper.plan(torch.rand(1, 48, 48), tolerance=1e-1)
         assert plan.fidelity.propagation == "exact"
 
