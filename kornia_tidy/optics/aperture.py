@@ -146,6 +146,7 @@ def check_aperture(aperture: Any, size: int) -> Tensor:
             f"aperture must have shape ({size}, {size}), or (K, {size}, {size}) with amplitudes for K masks, got "
             f"{tuple(aperture.shape)}"
         )
+    check_values("aperture", aperture)
     amplitude = aperture.to(torch.float64, copy=True)  # later edits of the user's array change nothing
     valid = (amplitude >= 0) & (amplitude <= 1)  # False for NaN too
     if not bool(valid.all()):

@@ -245,14 +245,13 @@ class RuledClosedForm(ClosedForm):
         detail, variance, slope = (torch.stack(each).mean(0) for each in facts)
         of_scene = (detail - self.in_differences * variance).clamp(min=LEAST_DETAIL * variance)
         power = of_scene / self.photographs_detail.to(light)
-        content = power.maximum(CONTENT[0] * slope).minimum(CONTENT[1] * slope)
+        ratio = power / slope.clamp(min=torch.finfo(slope.dtype).tiny)
         left = BEFORE_BILATERAL * variance[:, None] * self.norms.square().to(light)
-        cost = content[:, None] * self.scene_errors.to(light) + left
+        cost = (ratio.clamp(*CONTENT) * slope)[:, None] * self.scene_errors.to(light) + left
         place = cost.argmin(1)[:, None, None, None].to(light) / STEPS
         squares = [part.square().nan_to_num().mean((1, 2, 3), keepdim=True) for _, part in windows]
         even = torch.stack(squares).mean(0).sqrt().clamp(min=LEAST_NOISE)
-        ratio = (power / slope.clamp(min=torch.finfo(slope.dtype).tiny))[:, None, None, None]
-        return Settings(even, place, self._color_of_least_risk(windows, place), ratio)
+        return Settings(even, place, self._color_of_least_risk(windows, place), ratio[:, None, None, None])
 
     def _is_of_sensor(self, light: Tensor, noise: Tensor) -> Tensor:
         """Return whether the noise of a tile without stray light is that of the sensor, and no other that was told."""
@@ -397,7 +396,7 @@ def _parabolas(halves: Tensor) -> Tensor:
 
 
 def _at(table: Tensor, place: Tensor) -> Tensor:
-    """Interpolate linearly between the rows of a table (N, M) at places (B, 1, 1, 1); the result is (B, M)."""
+    """Interpolate linearly between the rows of a table (N, M) at places (B, 1, 1, 1) from 0 to N - 1, as (B, M)."""
     steps = torch.arange(len(table), device=table.device)
-    shares = (1 - (place.flatten()[:, None].clamp(0, len(table) - 1) - steps).abs()).clamp(min=0)
+    shares = (1 - (place.flatten()[:, None] - steps).abs()).clamp(min=0)
     return shares.to(table) @ table
