@@ -375,7 +375,7 @@ def _above(noise: Tensor) -> Tensor:
 
 def interpolated(estimates: Tensor, place: Tensor) -> Tensor:
     """Interpolate linearly between estimates (B, D, C, H, W) at a place (B, C, H, W) among them, from 0 to D - 1."""
-    place = place.clamp(0, estimates.shape[1] - 1)
+    place = place.clamp(0.0, estimates.shape[1] - 1.0)  # real ends: ONNX mixes up whole ones of two such calls
     steps = torch.arange(estimates.shape[1], device=place.device)[:, None, None, None]
     shares = (1 - (place.unsqueeze(1) - steps).abs()).clamp(min=0)
     return (shares * estimates).sum(1)
