@@ -26,8 +26,8 @@ from kornia_tidy.kernels.build import compiled
 from kornia_tidy.kernels.scattered_ops import SOURCE, Points, Transform, scattered_light, scattered_light_by_torch
 from kornia_tidy.mode import Mode, torch_mode
 
-_SIGMA = 1.15  # period of the transform over the window: light beyond it folds back outside the used part
-_DENSITY = 1.1  # samples of the intensity over those that its bandwidth needs
+_SIGMA = 1.2  # period of the transform over the window: light beyond it folds back outside the used part
+_DENSITY = 1.15  # samples of the intensity over those that its bandwidth needs
 _DIM = 0.2  # power of the tolerance
 _NODES = 96
 _STEP = 0.25  # pixels in which the largest shift is counted
