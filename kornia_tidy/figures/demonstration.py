@@ -15,6 +15,7 @@ from kornia_tidy.figures.depth import depth_colors
 from kornia_tidy.figures.explained import explain
 from kornia_tidy.figures.style import encoded_figure
 from kornia_tidy.modulator.modulator import DwellTimes
+from kornia_tidy.reconstruction.head_names import ANY_CAMERA
 from kornia_tidy.reconstruction.metrics import psnr, rmse, ssim
 from kornia_tidy.sensor.exposure import electrons_at
 
@@ -56,7 +57,7 @@ def comparison_page(
         f"{light_in_words(cameras, electrons)}.",
         "Closed form: the linear filter with the least expected error by the statistics of photographs (Wiener), then "
         "a filter that smooths noise and keeps edges (bilateral).",
-        "A network was trained for its camera. White square: the detail in the corner, three times as large. "
+        f"{_training_in_words(cameras['coded'])} White square: the detail in the corner, three times as large. "
         f"Masks against no masks: {verdict_in_words(results, scene)}.",
     ]
     subtitle = "One scene, the same exposure time, the same light: from the capture to an image in focus everywhere"
@@ -93,6 +94,13 @@ def _joint_panels(camera: Camera, result: Result, scene: Scene, near: Tensor) ->
             zoomed=False,
         ),
     ]
+
+
+def _training_in_words(camera: Camera) -> str:
+    """Return what the networks of a page were trained for, whose camera with masks is given."""
+    if camera.settings is not None and camera.settings.head == ANY_CAMERA:
+        return "The upper network restores any camera, each other one was trained for its camera."
+    return "A network was trained for its camera."
 
 
 def _name(camera: Camera) -> str:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -56,9 +57,14 @@ class TestDemo(BaseTester):
         assert slow > fast
 
     @pytest.mark.takes_seconds
-    def test_feature_a_camera_made_up_on_the_command_line_is_restored_without_training(self, tmp_path, capsys):
+    def test_feature_a_camera_made_up_on_the_command_line_is_restored_without_training(
+        self, tmp_path, capsys, monkeypatch
+    ):
+        drawn = Mock(wraps=demonstration.draw_comparison)
+        monkeypatch.setattr(demonstration, "draw_comparison", drawn)
         made_up = ["--masks", "2", "--family", "zernike", "--f-number", "20"]
         assert main(["demo", "-o", str(tmp_path), "--size", "128", *made_up]) == 0
+        assert "The upper network restores any camera" in drawn.call_args.args[3][2]
         (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("coded"))
         assert "2 masks, f/20" in line
         capture, closed_form, network = (float(value) for value in re.findall(r"([\d.]+) dB", line))
