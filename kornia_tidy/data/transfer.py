@@ -110,8 +110,8 @@ def _middle(curve: bytes) -> float:
         (count,) = struct.unpack_from(">I", curve, 8)
         if count == 0:
             return 0.5
-        (value,) = struct.unpack_from(">H", curve, 12 + 2 * ((count - 1) // 2))
-        return 0.5 ** (value / 256) if count == 1 else value / 65535
+        low, high = (struct.unpack_from(">H", curve, 12 + 2 * entry)[0] for entry in ((count - 1) // 2, count // 2))
+        return 0.5 ** (low / 256) if count == 1 else (low + high) / 2 / 65535
     if curve.startswith(b"para"):
         (kind,) = struct.unpack_from(">H", curve, 8)
         gamma, a, b = (

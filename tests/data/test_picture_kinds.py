@@ -78,7 +78,8 @@ def profiled(kind, curve):
     return file.getvalue()
 
 
-CURVES = [  # one identity in four forms, and sRGB
+CURVES = [  # one identity in five forms, and sRGB
+    b"curv" + bytes(4) + struct.pack(">IHH", 2, 0, 65535),
     b"curv" + bytes(8),
     b"curv" + bytes(4) + struct.pack(">IH", 1, 256),
     b"curv" + bytes(4) + struct.pack(">I256H", 256, *range(0, 65536, 257)),
