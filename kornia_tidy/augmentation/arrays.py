@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from functools import cache, lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -127,7 +128,8 @@ def reconstruct(
         memory_budget: see :func:`~kornia_tidy.reconstruction.tiled.reconstruct_tiled`.
 
     Returns:
-        Image and depth, None for a map that the system was not trained for.
+        Image and depth, None for a map that the system was not trained for. A warning tells what was repaired in a
+        capture, and what contradicts the noise or encoding told of it, such as linear light taken for sRGB.
 
     Raises:
         TypeError: if an argument is not an array, or has another data type.
@@ -151,6 +153,8 @@ def reconstruct(
         system = any_camera_system(system, sensor_of(light[0]))
     head = _light_head(system)
     found = [reconstruct_light(head, one, memory_budget=memory_budget) for one in light]
+    for note in dict.fromkeys(note for one in found for note in one.notes):
+        warnings.warn(f"capture: {note}", stacklevel=2)
     images = [one.image for one in found if one.image is not None]
     depths = [one.depth[0] for one in found if one.depth is not None]
     like = capture[..., None] if capture.ndim == 2 else capture  # a grey capture too becomes an image of three channels

@@ -57,7 +57,7 @@ def comparison_page(
         f"{light_in_words(cameras, electrons)}.",
         "Closed form: the linear filter with the least expected error by the statistics of photographs (Wiener), then "
         "a filter that smooths noise and keeps edges (bilateral).",
-        f"{_training_in_words(cameras['coded'])} White square: the detail in the corner, three times as large. "
+        f"{_training_in_words(cameras['coded'])} White square: the detail in the corner, three times as large.",
         f"Masks against no masks: {verdict_in_words(results, scene)}.",
     ]
     subtitle = "One scene, the same exposure time, the same light: from the capture to an image in focus everywhere"

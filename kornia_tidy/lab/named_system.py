@@ -25,7 +25,7 @@ def head_file(head: str) -> Path:
     if head in PRETRAINED:
         return FOLDER / f"{head}.safetensors"
     if head in CLOSED_FORMS:
-        raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs, or its masks to raw reconstruct")
+        raise ValueError(f"the head {head!r} needs the PSFs of a camera: give --psfs, or --masks or its file")
     if head in REPLACED:
         check_shipped(head)
     if not Path(head).exists():

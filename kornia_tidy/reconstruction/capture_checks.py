@@ -293,7 +293,7 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     Example:
         >>> light = 0.5 + 0.01 * torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0))
         >>> check_capture(light, MeasuredNoise(1e-6, 0.0)).notes
-        ('its noise is 0.01 of full scale, 10 times the stated noise: give noise=0.01',)
+        ('its noise is 0.01 of full scale, 10 times the stated noise: --noise 0.01 or SensorNoise(0.01)',)
     """
     height, width = light.shape[-2:]
     top, left = max(0, (height - LARGEST) // 2), max(0, (width - LARGEST) // 2)
@@ -318,7 +318,8 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     if told is not None and found > TWICE * told.std(level):
         factor = found / max(told.std(level), 1e-9)
         notes.append(
-            f"its noise is {found:.2g} of full scale, {factor:.0f} times the stated noise: give noise={found:.2g}"
+            f"its noise is {found:.2g} of full scale, {factor:.0f} times the stated noise: "
+            f"--noise {found:.2g} or SensorNoise({found:.2g})"
         )
     blocks = blockiness(middle) > JPEG
     if blocks:

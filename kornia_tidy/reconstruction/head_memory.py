@@ -17,10 +17,10 @@ def head_bytes(head: nn.Module, image: Tensor) -> int:
     """Return the peak memory of a network for an image, including the image and its output.
 
     It is the largest sum of all tensors alive after an operation. For a convolution, input and output are counted
-    twice, as some libraries copy both to another memory layout.
+    twice unless the input is in channels-last format, as some libraries copy both to another memory layout.
 
     Args:
-        head: the network. Its weights are not counted.
+        head: the network. Its weights and buffers are not counted.
         image: (B, C, H, W).
 
     Returns:
@@ -30,7 +30,7 @@ def head_bytes(head: nn.Module, image: Tensor) -> int:
         >>> head_bytes(nn.Conv2d(3, 8, 1), torch.rand(1, 3, 10, 10))  # twice input and output
         8800
     """
-    with _Living() as living:
+    with _Living(head) as living:
         image = image.clone()  # so that it is counted
         head(image)
     return living.most
@@ -39,10 +39,14 @@ def head_bytes(head: nn.Module, image: Tensor) -> int:
 class _Living(TorchDispatchMode):
     """Dispatch mode that sums the memory of all tensors alive after each operation."""
 
-    def __init__(self) -> None:
+    def __init__(self, head: nn.Module) -> None:
         super().__init__()
         self.most = self._now = 0
-        self._known: set[int] = set()
+        self._known = {part.untyped_storage()._cdata for part in (*head.parameters(), *head.buffers())}
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # to skip torch's compiler would import it, for seconds
 
     def __torch_dispatch__(
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -52,7 +56,7 @@ class _Living(TorchDispatchMode):
             if isinstance(tensor, Tensor):
                 self._born(tensor.untyped_storage())
         reordered = 0
-        if func is torch.ops.aten.convolution.default:
+        if func is torch.ops.aten.convolution.default and not args[0].is_contiguous(memory_format=torch.channels_last):
             reordered = args[0].nbytes + output.nbytes
         self.most = max(self.most, self._now + reordered)
         return output

@@ -147,7 +147,7 @@ def from_pretrained(
     else:
         raise FileNotFoundError(
             f"there is no folder {name}, and the name of a repository is OWNER/NAME; shipped systems are "
-            f"{', '.join(PRETRAINED)}"
+            f"{', '.join(PRETRAINED)}; for the network any-camera give the camera, a TiDyOptics or PSFBank"
         )
     values = read_json(config)
     if not isinstance(values, dict) or values.get("format") != FORMAT:

@@ -81,8 +81,8 @@ class NAFNet(ReconstructionHead):
             skips.append(blocks(features))
             features = down(skips[-1])
         features = self.middle(features)
-        for blocks, up, skip in zip(reversed(self.decoder), reversed(self.up), reversed(skips), strict=True):
-            features = blocks(functional.pixel_shuffle(up(features), 2) + skip)
+        for blocks, up in zip(reversed(self.decoder), reversed(self.up), strict=True):
+            features = blocks(functional.pixel_shuffle(up(features), 2) + skips.pop())  # whose memory is freed
         return self.last(features)
 
     def reset_parameters(self) -> None:
@@ -138,8 +138,8 @@ class _Block(nn.Module):
         if self.attention is not None:
             around = functional.avg_pool2d(mixed, ATTENTION, 1, ATTENTION // 2, count_include_pad=False)
             mixed = mixed * self.attention(around)
-        features = features + _scaled(self.project1, self.beta, mixed)
-        return features + _scaled(self.project2, self.gamma, _gate(self.expand2(self.norm2(features))))
+        features = _scaled(self.project1, self.beta, mixed).add_(features)
+        return _scaled(self.project2, self.gamma, _gate(self.expand2(self.norm2(features)))).add_(features)
 
     def reset_parameters(self) -> None:
         for scale in (self.beta, self.gamma):

@@ -23,6 +23,7 @@ from kornia_tidy.reconstruction.receptive_field import (
     take_receptive_field,
     total_stride,
 )
+from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
 from kornia_tidy.reconstruction.tile_grid import Span, TileGrid
 from kornia_tidy.reconstruction.tile_place import TilePlace
 from kornia_tidy.reconstruction.whole_picture import closed_forms_without_statistics, whole_picture
@@ -213,7 +214,10 @@ def _bytes_a_pixel(head: nn.Module, image: Tensor) -> float:
     if kind not in counted:
         stride = total_stride(head)
         side = -(-_COUNTED_ON // stride) * stride
-        counted[kind] = head_bytes(head, like.new_zeros(*image.shape[:2], side, side)) / side**2
+        part = like.new_zeros(*image.shape[:2], side, side).contiguous(memory_format=torch.channels_last)
+        if any(isinstance(module, RuledClosedForm) for module in head.modules()):
+            head(part[..., :stride, :stride])  # finds the settings of the picture, whose memory is not a tile's
+        counted[kind] = head_bytes(head, part) / side**2
     return counted[kind]
 
 

@@ -172,7 +172,7 @@ class TestReconstruct(BaseTester):
         assert image.shape == (32, 48, 3)
 
     def test_exception(self, head):
-        with pytest.raises(FileNotFoundError, match=r"there is no folder joint-9, .* shipped systems are"):
+        with pytest.raises(FileNotFoundError, match=r"there is no folder joint-9, .* shipped systems .* the camera"):
             kornia_tidy.reconstruct(picture("uint8", 8, 8, 3), "joint-9")
         with pytest.raises(ValueError, match=r"captures must be one or more, got shape \(0, 8, 8, 3\)"):
             kornia_tidy.reconstruct(picture("uint8", 0, 8, 8, 3), head)
@@ -254,3 +254,5 @@ class TestReconstructAnyCamera(BaseTester):
         told = kornia_tidy.reconstruct(capture, optics).image
         found = kornia_tidy.reconstruct(capture, closed_form_bank(optics, 7)).image
         assert float(np.square(found - told).mean()) < 0.05 * float(np.square(capture - told).mean())
+        with pytest.warns(UserWarning, match=r"capture: its noise is 0.02.*, 10 times the stated"):
+            kornia_tidy.reconstruct(capture, TiDyOptics(fidelity="draft", sensor=SensorNoise(0.002)))

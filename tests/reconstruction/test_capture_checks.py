@@ -141,7 +141,7 @@ class TestCheckCapture(BaseTester):
     def test_feature_noise_that_is_told_too_small(self):
         light, sensor = capture(1000.0)
         (note,) = check_capture(light, MeasuredNoise(*(0.04 * part for part in told(sensor)))).notes
-        assert "5 times the stated noise: give noise=0.0" in note
+        assert "5 times the stated noise: --noise 0.0" in note
         assert not check_capture(light, MeasuredNoise(*(3 * part for part in told(sensor)))).notes
 
     @pytest.mark.parametrize("quality", [80, 92])
