@@ -47,8 +47,9 @@ def repair_outliers(light: Tensor, noise: MeasuredNoise) -> Repaired:
     r"""Replace pixels that differ from all of their neighbours by more than noise does, such as hot and dead ones.
 
     A pixel is an outlier if it is beyond the largest or smallest of its eight neighbours by six standard deviations of
-    the noise, and by half of the neighbours' range. The median of the neighbours takes its place. Borders are
-    reflected.
+    the noise, and by half of the neighbours' range. What takes its place is half the sum of the four beside it less a
+    quarter of that of the corners, exact where light is linear or quadratic along rows and columns, between the second
+    lowest and the second highest of them. Borders are reflected.
 
     Args:
         light: (C, H, W) linear light, at least 2 x 2 pixels.
@@ -88,7 +89,11 @@ def _repaired(part: Tensor, noise: MeasuredNoise) -> tuple[Tensor, tuple[Tensor,
     deviation = (noise.dark + noise.rise * highest).clamp(min=0).sqrt()
     margin = torch.maximum(BEYOND * deviation, CONTRAST * (highest - lowest))
     place = ((own > highest + margin) | (own < lowest - margin)).nonzero(as_tuple=True)
-    return torch.stack([other[place] for other in around]).median(0).values, place
+    found = torch.stack([other[place] for other in around])
+    pairs = found[:4] + found[4:].flip(0)  # opposite neighbours, so that a picture that lies is repaired alike
+    beside, corners = pairs[1] + pairs[3], pairs[0] + pairs[2]
+    ordered = found.sort(0).values
+    return ((2 * beside - corners) / 4).clamp(ordered[1], ordered[-2]), place
 
 
 class WithoutBands(NamedTuple):
@@ -307,7 +312,7 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     most = noise if told is None else MeasuredNoise(*map(max, noise, told))  # JPEG shows less than the sensor's
     repaired = repair_outliers(light, most)
     if repaired.count:
-        notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced by their neighbours' median")
+        notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced by what their neighbours let expect")
     even = repair_bands(repaired.light, found)
     if even.size:
         bands = "rows" if even.rows else "columns"
