@@ -312,7 +312,7 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     most = noise if told is None else MeasuredNoise(*map(max, noise, told))  # JPEG shows less than the sensor's
     repaired = repair_outliers(light, most)
     if repaired.count:
-        notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced by what their neighbours let expect")
+        notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced from their neighbours")
     even = repair_bands(repaired.light, found)
     if even.size:
         bands = "rows" if even.rows else "columns"
