@@ -207,11 +207,14 @@ units in a metre give 0.001, not 1000; for metres 1 (--depth-scale)
 def as_array(name: str, value: Any) -> np.ndarray:
     """Return an array or a PIL image as an array."""
     if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "biufc":
+            raise TypeError(f"{name} must hold numbers, got {value.dtype}")
         return value
     pil = sys.modules.get("PIL.Image")
     if pil is not None and isinstance(value, pil.Image):
-        if value.mode not in ("L", "RGB", "I;16", "I", "F"):
-            raise ValueError(f"{name} must be a PIL image in mode L, RGB or I;16, got {value.mode}: convert('RGB')")
+        if value.mode not in ("L", "RGB", "I;16", "I;16B", "I", "F"):
+            modes, remedy = ("L, I;16, I or F", "") if name == "depth" else ("L, RGB or I;16", ": convert('RGB')")
+            raise ValueError(f"{name} must be a PIL image in mode {modes}, got {value.mode}{remedy}")
         return np.array(value)
     raise TypeError(f"{name} must be a tensor, a NumPy array or a PIL image, got {described(value)}")
 

@@ -53,6 +53,8 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         data = path.read_bytes()
     except MemoryError:
         raise ValueError(f"cannot read {path}: its {path.stat().st_size} bytes are more than the memory") from None
+    except OSError as error:  # of a disk or a network drive names no file
+        raise type(error)(f"cannot read {path}: {error.strerror or error}") from None
     if not data:
         raise ValueError(f"cannot read {path}: the file is empty")
     return data

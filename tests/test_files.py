@@ -46,10 +46,12 @@ class TestReading(BaseTester):
             read_image(tmp_path / "pipe.png")
 
     @pytest.mark.timeout(20)
-    @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="there is no such device")
-    def test_exception_a_device_is_refused(self):
+    @pytest.mark.skipif(not os.path.exists("/proc/self/mem"), reason="there is no such file")
+    def test_exception_a_device_is_refused_and_a_file_that_cannot_be_read_is_named(self):
         with pytest.raises(ValueError, match="cannot read /dev/zero: it is not a regular file"):
             read_bytes("/dev/zero")
+        with pytest.raises(OSError, match=r"^cannot read /proc/self/mem: Input/output error$"):
+            read_bytes("/proc/self/mem")
 
     def test_exception_a_name_that_no_file_can_have(self, tmp_path):
         with pytest.raises(ValueError, match=r"cannot read .{60,100}\.\.\.: the name is too long$"):

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from kornia_tidy import PSFBank, TiDyOptics, moving_capture
+from kornia_tidy import NoMask, PSFBank, TiDyOptics, moving_capture
 from kornia_tidy.data import write_depth, write_image
 from kornia_tidy.lab.mask_export import write_heights
 from tests.base import BaseTester
@@ -25,6 +25,7 @@ CAMERA = TiDyOptics()
 
 CALLS: dict[str, Callable[[], Any]] = {
     "a camera that was moved": lambda: TiDyOptics().to("meta")(IMAGE.to("meta"), DEPTH.to("meta")),
+    "behind a lens": lambda: under_meta(partial(TiDyOptics(NoMask(23), lens="single-50mm"), IMAGE, DEPTH)),
     "its PSFs": lambda: TiDyOptics().to("meta").psf_bank(),
     "its noise": lambda: CAMERA.draw(IMAGE.to("meta")),
     "a plan": lambda: CAMERA.plan(DEPTH.to("meta")),

@@ -263,4 +263,4 @@ def _shape_remedy(image: NDArray[Any]) -> str:
         return ": drop alpha with image[..., :3]"
     if image.ndim in {3, 4} and image.shape[-3] in {1, 3}:
         return f": channels come last, np.moveaxis(image, {image.ndim - 3}, -1)"
-    return ": a batch of grey images is image[..., None]" if image.ndim == 3 else ""
+    return ": a batch of grey images is image[..., None]" if image.ndim == 3 and image.size else ""

@@ -169,16 +169,16 @@ class OpticsPipeline(nn.Module):
         return coded, depth, image, valid, others
 
     def _place(self, before: Tensor, after: Tensor, place: Any) -> Any:
-        """Return where the warped pictures lie in the field of the camera's lens; None where nothing says it."""
+        """Return where the warped pictures lie in the camera's field; None where nothing says it."""
         camera = camera_of(self.optics)
-        if camera is None or camera.lens is None or self.geometry is None:
+        if camera is None or not camera.psf_model.varies or self.geometry is None:
             return place
         return self.geometry.field_center(before, after, camera.field_center if place is None else place)
 
     def _draws(self, image: Tensor, params: dict[str, Any] | None, place: Any) -> dict[str, Any] | None:
         """Return the draws of an augmentation, with the place of each image where that is known."""
         optics, camera = self.optics, camera_of(self.optics)
-        if place is None or params is not None or camera is None or camera.lens is None:
+        if place is None or params is not None or camera is None or not camera.psf_model.varies:
             return params
         assert isinstance(optics, DepthAugmentation)
         return draws_at(optics, image, place)

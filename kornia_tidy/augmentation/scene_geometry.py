@@ -135,7 +135,7 @@ class SceneGeometry(nn.Module):
         """Return where the pictures of the last call lie, seen from the axis of the lens that is to take them.
 
         A crop lies off the axis as far as its middle lies from that of the picture it was cut from. A flip, a rotation
-        or a change of size moves the place as it moves the picture about the axis.
+        or a change of size moves the place as it moves the picture about the axis; a perspective as in the middle.
 
         Args:
             before: the images that were given.
@@ -159,14 +159,16 @@ class SceneGeometry(nn.Module):
         count = 1 if after.ndim == 3 else len(after)
         places = torch.tensor(check_centers(center, count), dtype=torch.float64).expand(count, 2)
         (rows, columns), (height, width) = before.shape[-2:], after.shape[-2:]
-        middle = torch.tensor([(rows - 1) / 2, (columns - 1) / 2], dtype=torch.float64)
-        axis = torch.cat([(middle - places).flip(1), torch.ones(count, 1, dtype=torch.float64)], 1)
-        matrix = self.container.transform_matrix
-        if matrix is None:
+        axis = torch.tensor([(columns - 1) / 2, (rows - 1) / 2], dtype=torch.float64) - places.flip(1)
+        middle = torch.tensor([(width - 1) / 2, (height - 1) / 2, 1], dtype=torch.float64)
+        if (matrix := self.container.transform_matrix) is None:
             raise ValueError("the place of a picture in the field needs a warp with a matrix, got none")
-        moved = (matrix.detach().cpu().double() @ axis[..., None])[..., 0]
-        there = (moved[:, :2] / moved[:, 2:]).flip(1)
-        found = torch.tensor([(height - 1) / 2, (width - 1) / 2], dtype=torch.float64) - there
+        back = torch.linalg.inv(matrix.detach().cpu().double())
+        there = back @ middle  # what the middle shows, times there[:, 2]
+        # The axis may lie beyond the horizon of a perspective: its place follows from the warp at the middle.
+        shown = there[:, :2] / there[:, 2:]
+        slopes = (back[:, :2, :2] - shown[..., None] * back[:, 2:, :2]) / there[:, 2, None, None]
+        found = torch.linalg.solve(slopes, shown - axis).flip(1)
         found = found.round(decimals=3)  # matrices are float32, and equal places have the same PSFs
         return found[0] if after.ndim == 3 else found
 

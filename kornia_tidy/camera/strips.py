@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from kornia_tidy.camera.samples import BYTES_A_VALUE, BYTES_OF_TILES, Sample
+from kornia_tidy.kernels.occlusion_ops import BLOCK_ROWS
 from kornia_tidy.psf.field import Field
 from kornia_tidy.render.borders import extended
 from kornia_tidy.sensor.sensor import STRIP
@@ -62,7 +63,7 @@ def strips_of(
 
     Args:
         sample: image and depth.
-        rows: of a strip.
+        rows: of a strip; the last one may have some more.
         height: of the capture.
         radius: of the PSFs: how far the image of a strip reaches beyond it, to be rendered with the border ``"valid"``.
         border: of the capture.
@@ -71,12 +72,12 @@ def strips_of(
     sides = "replicate" if border == "zero" else border  # black has no depth
     before = 0 if border == "valid" else radius
     columns = -before, sample.image.shape[-1] + before
-    for top in range(0, height, rows):
-        own = slice(top, min(top + rows, height))
-        seen = top - before, own.stop - before + 2 * radius
+    tops = range(0, max(1, height - BLOCK_ROWS + 1), rows)  # what is left may be too low for compiled occlusion
+    for top, end in zip(tops, [*tops[1:], height], strict=True):
+        seen = top - before, end - before + 2 * radius
         image = extended(sample.image, seen, columns, border).to(sample.dtype)
         depth = extended(sample.depth, seen, columns, sides).to(sample.dtype)
-        yield own, image, depth, tuple(field.moved(top - before, -before) for field in fields)
+        yield slice(top, end), image, depth, tuple(field.moved(top - before, -before) for field in fields)
 
 
 def placed(whole: Tensor | None, part: Tensor, rows: slice, height: int) -> Tensor:

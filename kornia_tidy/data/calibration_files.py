@@ -12,6 +12,7 @@ from kornia_tidy.files import error_prefix, read_json, read_text
 
 OPTIONS = ("focal_px", "baseline_m", "doffs_px", "scale")
 _ENTRY = re.compile(r"^\s*(\w+)\s*=\s*(\[[^\]]*\]|[-+.\deE]+)\s*$", re.MULTILINE)
+_NAMED = re.compile(r"^\s*(cam0|baseline|doffs)\s*[=:].*$", re.MULTILINE | re.IGNORECASE)
 
 
 def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
@@ -41,18 +42,23 @@ def read_calibration(path: str | os.PathLike[str]) -> dict[str, float]:
     if Path(path).suffix.lower() == ".json":
         values: Any = read_json(path)
         if not isinstance(values, dict) or not values or not set(values) <= set(OPTIONS):
-            raise ValueError(f"cannot read {path}: a calibration holds some of {', '.join(OPTIONS)}, and nothing else")
+            known = f"a calibration holds some of {', '.join(OPTIONS)}, and nothing else"
+            raise ValueError(f"cannot read {path}: {known}, got {values!s:.80}")
         if wrong := [name for name, value in values.items() if type(value) not in {int, float}]:
             raise ValueError(f"cannot read {path}: {wrong[0]} must be a number, got {values[wrong[0]]!r:.40}")
     else:
-        found = _ENTRY.findall(read_text(path, "replace"))
+        text = "\n".join(read_text(path, "replace").splitlines())
+        found = _ENTRY.findall(text)
         entries = dict(found)
+        if unread := [line[0] for line in _NAMED.finditer(text) if line[1].lower() not in entries]:
+            raise ValueError(f"cannot read {path}: {unread[0].strip()!r:.80} is no number, with a point, or matrix")
         if len(entries) < len(found):
             raise ValueError(f"cannot read {path}: it gives an entry twice: {', '.join(name for name, _ in found)}")
         camera = re.findall(r"[-+.\deE]+", entries.get("cam0", ""))
         if len(camera) != 9 or not {"baseline", "doffs"} <= set(entries):
             raise ValueError(
-                f"cannot read {path}: Middlebury's calibration has cam0=[f 0 cx; 0 f cy; 0 0 1], baseline= and doffs="
+                f"cannot read {path}: Middlebury's calibration has cam0=[f 0 cx; 0 f cy; 0 0 1], baseline= and doffs=, "
+                f"found {', '.join(entries)[:80] or 'none of them'}"
             )
         values = {"focal_px": camera[0], "baseline_m": entries["baseline"], "doffs_px": entries["doffs"]}
     with error_prefix(f"cannot read {path}", OverflowError, TypeError):

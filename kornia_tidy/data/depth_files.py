@@ -83,14 +83,15 @@ def read_depth(
         - Always unknown: NaN, a stored integer 0 (as Kinect, KITTI and Middlebury mean it), depth of 0 or less, and
           disparity that is infinite or, with d added, negative.
         - Unknown in a TIFF: pixels with GDAL's missing value, behind a mask, transparent, or left out of the file; see
-          :func:`~kornia_tidy.data.tiff.decode_tiff`. In HDF5: ``_FillValue`` and ``missing_value``. A factor that the
-          file gives for its numbers is not applied. A warning, once per folder, names it if ``scale`` is another.
+          :func:`~kornia_tidy.data.tiff.decode_tiff`. In HDF5: ``_FillValue``, ``missing_value`` and numbers outside
+          ``valid_range``. A factor or unit that the file gives for its numbers is not applied. A warning, once per
+          folder, names it if ``scale`` is another.
         - Infinite depth is valid, such as a sky, and so is a floating-point disparity that is 0 with d added. List
           them in ``invalid`` for a data set that means *unknown* by them.
         - A warning, once per folder, names values that look like *unknown* and are not listed: the largest of the data
           type, such as 65535, far above all others; in a PFM file infinity below values as large as disparities.
         - Renderers write 1e10 (Blender) or infinity where a ray hits nothing. Both are depths, and to a lens the same.
-        - A grey level that a PNG file declares transparent is unknown, as GDAL means it.
+        - Transparent pixels of PNG and PAM files are unknown, by alpha or, as GDAL means it, by their grey level.
         - The orientation of a file is not applied. A warning, once per folder, size and orientation, tells of it.
         - A hole takes the value of the nearest known pixel; see :func:`~kornia_tidy.data.fill_holes`.
 

@@ -63,9 +63,10 @@ class _Header(NamedTuple):
 def decode_exr(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     """Decode the depth in an OpenEXR file. It needs ``pip install 'kornia-tidy[exr]'``.
 
-    A single channel is depth. Of several, depth is the one that is named ``Z``, ``V`` or ``depth`` in any layer, or a
-    grey layer with *depth* in its name. Coordinates of vectors (``X``, ``Y``, ``Z``; ``U``, ``V``) and Blender's mist
-    and denoising data do not count. Without such a name, depth is red if red, green and blue are equal.
+    A single channel is depth, unless it is alpha or mist. Of several, depth is the one that is named ``Z``, ``V`` or
+    ``depth`` in any layer, or a grey layer with *depth* in its name. Coordinates of vectors (``X``, ``Y``, ``Z``;
+    ``U``, ``V``) and Blender's mist and denoising data do not count. Without such a name, depth is red if red, green
+    and blue are equal.
 
     Args:
         data: bytes of the file.
@@ -190,14 +191,14 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
     Raises:
         ValueError: if no channel fits, or several do.
     """
-    if len(channels) == 1:
+    if len(channels) == 1 and channels[0].leaf != "A" and not _last(channels[0].layer).startswith(_NO_DEPTH):
         return [*channels]
     layers: dict[tuple[int, str], dict[str, _Channel]] = {}
     for channel in channels:
         layers.setdefault((channel.part, channel.layer), {})[channel.leaf] = channel
     found = []
     for (_, layer), members in layers.items():
-        name = layer.rpartition(".")[2].lower()
+        name = _last(layer)
         if name.startswith(_NO_DEPTH):
             continue
         named = [
@@ -216,6 +217,11 @@ def _depth_channels(channels: Sequence[_Channel]) -> list[_Channel]:
         reason = f"it may be any of {_listed([channel for channel, *_ in found])}" if found else "none is named for it"
         raise _unclear(reason, channels)
     return found[0]
+
+
+def _last(layer: str) -> str:
+    """Return the last part of a layer's name, in lower case."""
+    return layer.rpartition(".")[2].lower()
 
 
 def _unclear(reason: str, channels: Sequence[_Channel]) -> ValueError:

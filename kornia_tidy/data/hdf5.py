@@ -10,16 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kornia_tidy.data.picture_header import check_pixels
+from kornia_tidy.optics.units import metres_in
 from kornia_tidy.search_path import import_extra, import_installed
 
 DAMAGE = (OSError, OverflowError, RuntimeError, KeyError, TypeError, AttributeError)  # of h5py on damaged files
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _MISSING = ("_FillValue", "missing_value")
-_METRES = {
-    unit: metres
-    for short, long, metres in (("m", "", 1.0), ("cm", "centi", 1e-2), ("mm", "milli", 1e-3), ("km", "kilo", 1e3))
-    for unit in (short, f"{long}meter", f"{long}metre")
-}
+_UNITS = ("units", "unit", "Units", "Unit")
 
 
 def decode_hdf5(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None, float]:
@@ -30,26 +27,29 @@ def decode_hdf5(data: bytes) -> tuple[NDArray[Any], NDArray[np.bool_] | None, fl
 
     Returns:
         values: as they are stored.
-        unknown: True where they are the missing value of the attributes; None if these name none.
+        unknown: True where they are a missing value of the attributes or outside their valid range; None if these name
+            none.
         scale: metres in a unit by the attributes; 1 if they do not say it.
 
     Raises:
         ImportError: if h5py is missing.
-        ValueError: if the file is damaged, or holds no data set or several, or a data set in it that does not hold a
-            map of numbers, or whose attributes give an offset for them.
+        ValueError: if the file is damaged, or holds no data set or several beside the coordinates of axes, or one that
+            does not hold a map of numbers, or whose attributes give an offset for them, a factor that is not positive,
+            or a unit of inverse depth.
 
-    Source: NetCDF Climate and Forecast Metadata Conventions 1.11, sections 2.5.1, 3.1 and 8.1.
+    Source: NetCDF Climate and Forecast Metadata Conventions 1.11, sections 2.5.1, 3.1 and 8.1; NetCDF Users Guide,
+    attribute conventions (``_Unsigned``).
     """
     h5py = import_extra("h5py", "an HDF5 file")  # slow to import
     try:
         with h5py.File(io.BytesIO(data), "r") as file:
-            names = list(file)
+            names = [name for name in file if not _is_axis(file, name)]
             dataset = stored_numbers(file, names[0]) if len(names) == 1 else None
             if dataset is None:
                 raise ValueError(f"its HDF5 must hold only one data set, found {', '.join(names)[:80] or 'none'}")
             check_pixels("the map", *_rows_and_columns(dataset.shape))
             values = np.asarray(dataset[()])
-            return values, *_meaning(values, dataset.attrs)
+            return _meaning(values, dataset.attrs)
     except DAMAGE as error:
         raise ValueError(f"its HDF5 is damaged: {error!s:.200}") from error
 
@@ -79,19 +79,43 @@ def stored_numbers(file: Any, name: str) -> Any:
     return dataset
 
 
-def _meaning(values: NDArray[Any], attributes: Any) -> tuple[NDArray[np.bool_] | None, float]:
-    """Return where values are missing by the attributes, None if these do not say it, and the metres in a unit."""
-    given = {
-        name: np.ravel(attributes[name]) for name in (*_MISSING, "scale_factor", "add_offset") if name in attributes
-    }
-    numbers = {name: value[0] for name, value in given.items() if value.size == 1 and value.dtype.kind in "iuf"}
-    if numbers.get("add_offset", 0):
-        raise ValueError(f"its numbers are to be changed by add_offset {numbers['add_offset']:g}: save the depths")
-    unit = attributes.get("units", "")
-    unit = unit.decode("ascii", "replace") if isinstance(unit, bytes) else str(unit)
-    metres = _METRES.get(unit.strip().lower().removesuffix("s"), 1.0)
-    missing = [values == numbers[name] for name in _MISSING if name in numbers]
-    return np.logical_or.reduce(missing) if missing else None, float(numbers.get("scale_factor", 1)) * metres
+def _is_axis(file: Any, name: str) -> bool:
+    """Return whether a data set holds the coordinates along an axis of others, as NetCDF 4 has them."""
+    h5py = import_installed("h5py")
+    found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
+    return isinstance(found, h5py.Dataset) and found.ndim == 1 and h5py.h5ds.is_scale(found.id)
+
+
+def _meaning(values: NDArray[Any], attributes: Any) -> tuple[NDArray[Any], NDArray[np.bool_] | None, float]:
+    """Return values, where they are missing by their attributes, None if these do not say it, and metres in a unit."""
+    stored, meant = values.dtype, values.dtype
+    if _texts(attributes, "_Unsigned")[:1] in (["true"], ["True"]):
+        meant = np.dtype(stored.str.replace("i", "u"))
+
+    def numbers(name: str) -> NDArray[Any]:
+        found = np.ravel(attributes[name]) if name in attributes else np.empty(0)
+        found = found if found.dtype.kind in "iuf" else np.empty(0)
+        return found.view(meant) if found.dtype == stored else found
+
+    for name, least, most in (("add_offset", 0, 0), ("scale_factor", 5e-324, np.finfo(float).max)):
+        given = np.ravel(attributes.get(name, []))
+        if given.size and not (numbers(name).size == 1 and least <= numbers(name)[0] <= most):
+            raise ValueError(
+                f"its numbers are to be changed by {name} {given.tolist()!s:.40}: save the depths themselves"
+            )
+    values = values.view(meant)
+    missing = [values == number for name in _MISSING for number in numbers(name)]
+    missing += [values < least for name in ("valid_min", "valid_range") for least in numbers(name)[:1]]
+    missing += [values > most for name in ("valid_max", "valid_range") for most in numbers(name)[-1:]]
+    metres = math.prod(metres_in(unit) for name in _UNITS for unit in _texts(attributes, name)[:1])
+    scale = float(next(iter(numbers("scale_factor")), 1)) * metres
+    return values, np.logical_or.reduce(missing) if missing else None, scale
+
+
+def _texts(attributes: Any, name: str) -> list[str]:
+    """Return the texts of an attribute, of which there may be one or many."""
+    found = np.ravel(attributes[name]).tolist() if name in attributes else []
+    return [text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text) for text in found]
 
 
 def _rows_and_columns(shape: tuple[int, ...]) -> tuple[int, int]:

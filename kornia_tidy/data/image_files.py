@@ -17,6 +17,7 @@ from kornia_tidy.checks import check_choice
 from kornia_tidy.data.metadata import with_exif
 from kornia_tidy.data.orientation import tell_orientation
 from kornia_tidy.data.stored import Stored, read_stored
+from kornia_tidy.data.transfer import tell_linear
 from kornia_tidy.files import write_bytes
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -37,16 +38,18 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     Raises:
         FileNotFoundError: if the file is missing.
         ValueError: if it is not an image, is cut short or damaged, has other channels, types or floats outside [0, 1],
-            or needs more memory than the machine has.
+            is encoded for HDR (PQ or HLG), or needs more memory than the machine has.
 
     Warns:
         UserWarning: if viewers turn the picture, by its EXIF or XMP orientation: once for each folder, size and
-            orientation.
+            orientation; and if the file says that it holds linear light, once for each folder and format.
 
     Convention:
         - Alpha is dropped. Integers are divided by the maximum that a PGM, PPM or PAM file gives, else by the largest
           of their bits.
         - A TIFF holds one picture, of 1 to 16 bits, and is read as :func:`~kornia_tidy.data.tiff.decode_tiff` says.
+        - Numbers are not converted. A warning tells of a file that says by its ICC profile, gAMA or cICP that they are
+          linear light: give the camera ``color_space="linear"``.
         - The orientation is not applied: a depth map of the same camera has none, and calibrations refer to the pixels
           of the sensor. Depth that was estimated from the upright picture must be turned, as the warning says.
 
@@ -57,6 +60,14 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ...     read_image(f"{folder}/grey.png")
         tensor([[[0.0000, 0.2000, 1.0000]]])
     """
+    file = read_stored(path)
+    tell_orientation(path, file.orientation, file.values.shape[:2], "picture")
+    tell_linear(path, file.linear)
+    return as_image(file, path)
+
+
+def read_linear(path: str | os.PathLike[str]) -> Tensor:
+    """Read a picture of linear light: as :func:`read_image`, without the warning of a file that says so."""
     file = read_stored(path)
     tell_orientation(path, file.orientation, file.values.shape[:2], "picture")
     return as_image(file, path)

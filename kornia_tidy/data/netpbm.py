@@ -28,14 +28,16 @@ Shape = tuple[int, int, int]
 """Rows, columns and channels."""
 
 
-def decode_netpbm(data: bytes) -> tuple[NDArray[Any], int]:
+def decode_netpbm(data: bytes, depth: bool = False) -> tuple[NDArray[Any], int, NDArray[np.bool_] | None]:
     r"""Decode a PBM, PGM, PPM or PAM file of one picture.
 
     Args:
         data: bytes of the file.
+        depth: whether depth is wanted and not a picture.
 
     Returns:
-        The stored samples, (H, W, C) uint8 or uint16, without alpha; and the maximum, which means white.
+        The stored samples, (H, W, C) uint8 or uint16, without alpha; the maximum, which means white; and of depth with
+        alpha (H, W), True where it is transparent, else None.
 
     Raises:
         ValueError: if the header is damaged, the picture too large, the file cut short or longer than its picture, a
@@ -47,7 +49,7 @@ def decode_netpbm(data: bytes) -> tuple[NDArray[Any], int]:
     Source: Netpbm's pbm(5), pgm(5), ppm(5) and pam(5).
 
     Example:
-        >>> values, white = decode_netpbm(b"P2 3 1 # a comment\n15  0 5 15")
+        >>> values, white, _ = decode_netpbm(b"P2 3 1 # a comment\n15  0 5 15")
         >>> values[..., 0], white
         (array([[ 0,  5, 15]], dtype=uint8), 15)
     """
@@ -62,8 +64,9 @@ def decode_netpbm(data: bytes) -> tuple[NDArray[Any], int]:
         values = _raw_samples(data, end, shape, white, bitmap)
     if (largest := values.max(initial=0)) > white:
         raise ValueError(f"it holds {largest:.10g}, more than the maximum {white} in its header")
+    unknown = values[..., colours] == 0 if depth and shape[2] > colours == 1 else None
     values = values.astype(np.uint8 if white < 256 else np.uint16)[..., :colours]
-    return (1 - values if bitmap else values), white
+    return (1 - values if bitmap else values), white, unknown
 
 
 def _header(data: bytes) -> tuple[Shape, int, int, int]:

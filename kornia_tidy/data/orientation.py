@@ -9,14 +9,13 @@ from __future__ import annotations
 import os
 import re
 import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
 from typing import Literal
 
-from kornia_tidy.data.picture_header import JPEG, PNG, jpeg_segments, png_chunks
+from kornia_tidy.data.picture_header import JPEG, PNG, jpeg_segments, png_chunks, unfolded, webp_chunks
 from kornia_tidy.data.tiff_directories import Directory
 from kornia_tidy.optics.units import warn_once
 
@@ -35,7 +34,6 @@ _TAG = 0x0112
 _APP1, _START_OF_SCAN = 0xE1, 0xDA
 _EXIF, _XMP = b"Exif\0\0", b"ns.adobe.com/xap/1.0/\0"
 _XMP_TURN = re.compile(rb"""tiff:Orientation(?:\s*=\s*["']|>)\s*([1-8])\s*[<"']""")
-_LONGEST = 1 << 20  # bytes of a compressed text that are unfolded
 
 
 def orientation_of(data: bytes) -> int:
@@ -125,7 +123,7 @@ def _png(data: bytes) -> Iterator[bytes]:
             if keyword == b"XML:com.adobe.xmp":
                 yield text
             elif keyword in {b"Raw profile type exif", b"Raw profile type APP1", b"Raw profile type xmp"}:
-                yield _profile(_unfolded(text[1:]) if kind == b"zTXt" else text)
+                yield _profile(unfolded(text[1:]) if kind == b"zTXt" else text)
 
 
 def _profile(text: bytes) -> bytes:
@@ -136,17 +134,5 @@ def _profile(text: bytes) -> bytes:
         return b""
 
 
-def _unfolded(packed: bytes) -> bytes:
-    try:
-        return zlib.decompressobj().decompress(packed, _LONGEST)
-    except zlib.error:
-        return b""
-
-
 def _webp(data: bytes) -> Iterator[bytes]:
-    place = 12
-    while data.startswith(b"RIFF") and place + 8 <= len(data):
-        kind, length = struct.unpack_from("<4sI", data, place)
-        if kind in {b"EXIF", b"XMP "}:
-            yield data[place + 8 : place + 8 + length]
-        place += 8 + length + length % 2
+    return (data[begin:end] for kind, begin, end in webp_chunks(data) if kind in {b"EXIF", b"XMP "})

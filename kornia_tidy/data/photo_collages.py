@@ -21,6 +21,7 @@ from kornia_tidy.data.image_files import SUFFIXES, as_image
 from kornia_tidy.data.photographic_leaves import ZOOM, of_most, photographed, scattered
 from kornia_tidy.data.scene_dataset import Transform
 from kornia_tidy.data.stored import read_stored
+from kornia_tidy.data.transfer import tell_linear
 from kornia_tidy.files import find_files
 
 PIXELS_A_LEAF = (300.0, 40_000.0)  # of the final picture, uniform in its logarithm over the scenes
@@ -252,7 +253,9 @@ def _surroundings(light: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _cut(path: str | os.PathLike[str], height: int, width: int, draws: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return linear light of a part of a photograph, (H, W, 3), reduced, at a place and mirrored by four draws."""
-    photograph = as_image(read_stored(path), path)  # in any orientation, and without a word about it
+    stored = read_stored(path)
+    tell_linear(path, stored.linear)
+    photograph = as_image(stored, path)  # in any orientation, and without a word about it
     rows, columns = photograph.shape[-2:]
     largest = min(rows / height, columns / width)  # photograph's pixels along one that is painted
     least, most = (min(largest, value / ZOOM) for value in REDUCTION)

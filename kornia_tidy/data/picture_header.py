@@ -18,16 +18,24 @@ from typing import NamedTuple
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 LARGEST = 1 << 28  # pixels
 VARIABLE = "KORNIA_TIDY_MAX_PIXELS"
+_LONGEST = 1 << 20  # bytes of a compressed text that are unfolded
 FORMATS = "PNG, JPEG, TIFF, PBM, PGM, PPM, PAM, PFM, BMP, WebP, NPY or NPZ, and for depth OpenEXR or HDF5"
 
 OTHERS = (
     (0, b"GIF8", "GIF"), (4, b"ftyphei", "HEIF"), (4, b"ftypmif1", "HEIF"), (4, b"ftypavi", "AVIF"),
+    (4, b"ftyphev", "HEIF"), (4, b"ftypmsf1", "HEIF"), (0, b"CDF\1", "NetCDF 3"), (0, b"CDF\2", "NetCDF 3"),
     (0, b"\xff\x0a", "JPEG XL"), (4, b"JXL \r\n", "JPEG XL"), (4, b"jP  \r\n", "JPEG 2000"),
     (0, b"\xff\x4f\xff\x51", "JPEG 2000"), (0, b"#?R", "Radiance HDR"), (0, b"8BPS", "Photoshop"),
     (0, b"DDS ", "DDS"), (0, b"%PDF", "PDF"), (0, b"<svg", "SVG"), (0, b"<?xml", "XML"), (0, b"Ph", "a PFM of halves"),
     (0, b"PH", "a PFM of halves"), (0, b"PK\5\6", "an empty ZIP"), (0, b"SIMPLE  =", "FITS"), (0, b"MATLAB", "MATLAB"),
 )  # fmt: skip
 """Kinds of files that are not read: where they begin, with what, and their name."""
+RAW = (
+    (0, b"FUJIFILM", "Fujifilm RAF"), (0, b"IIRO", "Olympus ORF"), (0, b"IIRS", "Olympus ORF"),
+    (0, b"MMOR", "Olympus ORF"), (0, b"IIU\0", "Panasonic RW2"), (0, b"FOVb", "Sigma X3F"),
+    (0, b"\0MRM", "Minolta MRW"), (4, b"ftypcrx ", "Canon CR3"), (6, b"HEAPCCDR", "Canon CRW"),
+)  # fmt: skip
+"""Camera raw files that are no TIFF, likewise."""
 
 _STARTS_OF_FRAME = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # tables, reserved, arithmetic conditioning
 _DECODED_PROCESSES = {0, 1, 2, 9, 10}  # baseline, extended and progressive, with either entropy coding
@@ -54,8 +62,15 @@ def check_header(data: bytes) -> None:
                 raise ValueError("the file is cut short") from None
             check_pixels("the picture", rows, columns)
             return
+    if raw := next((name for place, beginning, name in RAW if data.startswith(beginning, place)), None):
+        refuse_raw(raw)
     name = next((name for place, beginning, name in OTHERS if data.startswith(beginning, place)), None)
     raise ValueError(f"it is {f'{name}, ' if name else ''}not an image in a known format: {FORMATS}")
+
+
+def refuse_raw(kind: str) -> None:
+    """Raise ``ValueError`` for a camera raw file."""
+    raise ValueError(f"it is a camera raw file ({kind}): develop it by kornia-tidy raw develop")
 
 
 def check_pixels(name: str, rows: int, columns: int) -> None:
@@ -91,6 +106,23 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
         place += 12 + length
 
 
+def unfolded(packed: bytes) -> bytes:
+    """Return the beginning of a compressed text or profile in a PNG; empty if it is damaged."""
+    try:
+        return zlib.decompressobj().decompress(packed, _LONGEST)
+    except zlib.error:
+        return b""
+
+
+def webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Yield the kind of each chunk of a WebP, and where its data begin and end."""
+    place = 12
+    while data.startswith(b"RIFF") and place + 8 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, place)
+        yield kind, place + 8, place + 8 + length
+        place += 8 + length + length % 2
+
+
 def _png(data: bytes) -> Size:
     """Return the size of a PNG; raise ``ValueError`` unless all critical chunks are complete and undamaged."""
     size = None
@@ -104,7 +136,7 @@ def _png(data: bytes) -> Size:
                 raise ValueError("the file is damaged: it does not begin with its size")
             columns, rows = struct.unpack_from(">II", data, begin)
             size = rows, columns
-        if kind == b"acTL":
+        if kind == b"acTL" and struct.unpack_from(">I", data, begin) > (1,):
             raise ValueError("it is an animated PNG, and one picture is read from a file")
     return size or (0, 0)
 

@@ -143,7 +143,8 @@ def described_folder(root: str | os.PathLike[str], transform: Transform | None =
         )
     about = read_json(path)
     if not isinstance(about, dict) or not {"image", "depth"} <= set(about) <= set(KNOWN):
-        raise ValueError(f'cannot read {path}: it should hold "image" and "depth" and may hold {", ".join(KNOWN[2:])}')
+        known = f'it should hold "image" and "depth" and may hold {", ".join(KNOWN[2:])}'
+        raise ValueError(f"cannot read {path}: {known}, got {about!s:.80}")
     for name, value in about.items():
         if kind := _other_kind(name, value):
             raise ValueError(f"cannot read {path}: {name} must be {kind}, got {value!r:.80}")
@@ -181,6 +182,8 @@ def _pair(root: Path, image: str, depth: str) -> list[tuple[str, str, str]]:
         raise ValueError(
             f"patterns must have a * and equally many of them, got image={image!r:.80}, depth={depth!r:.80}"
         )
+    if image == depth:
+        raise ValueError(f"image and depth must have different patterns, got {image!r:.80} for both")
     for pattern in (image, depth):
         _check_within(pattern)
     check_folder(root)

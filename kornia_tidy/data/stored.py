@@ -25,6 +25,7 @@ from kornia_tidy.data.picture_header import PNG, check_header, png_chunks
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.data.tiff import decode_tiff
 from kornia_tidy.data.tiff_directories import MAGIC as TIFF
+from kornia_tidy.data.transfer import is_linear
 from kornia_tidy.files import error_prefix, read_bytes
 
 # Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
@@ -46,6 +47,8 @@ class Stored(NamedTuple):
     """How the picture is to be turned for display, 1 to 8 as in EXIF; 1: not at all. The values are not turned."""
     scale: float = 1.0
     """Factor by which the file says that its numbers are to be multiplied. They are not."""
+    linear: bool = False
+    """Whether the file says that the numbers of a picture are linear light. They are not converted."""
 
 
 def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
@@ -62,7 +65,8 @@ def read_stored(path: str | os.PathLike[str], *, depth: bool = False) -> Stored:
             and bitmaps, palettes, and inverted greys are refused, since they are colours.
 
     Returns:
-        The numbers, and their description in the file; alpha is dropped.
+        The numbers, in the byte order of this machine, and their description in the file. Alpha is dropped; transparent
+        depth is marked as missing.
 
     Raises:
         FileNotFoundError: if the file is missing.
@@ -93,7 +97,8 @@ def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = Fa
         raise ValueError(f"cannot read {path}: an image has rows, columns and channels, this is {values.shape}")
     if values.dtype.kind not in "uif":
         raise ValueError(f"cannot read {path}: its values must be integers or real numbers, not {values.dtype}")
-    return stored._replace(values=values[..., :3] if values.shape[2] == 4 else values)
+    values = values[..., :3] if values.shape[2] == 4 else values
+    return stored._replace(values=values.astype(values.dtype.newbyteorder("="), copy=False))
 
 
 def _decode(data: bytes, depth: bool) -> Stored:
@@ -117,12 +122,12 @@ def _decode(data: bytes, depth: bool) -> Stored:
     if data.startswith(NETPBM):
         if depth and data.startswith((b"P1", b"P4")):
             raise ValueError("it is a bitmap (PBM) of black and white, which is no depth")
-        return Stored(*decode_netpbm(data))
+        return Stored(*decode_netpbm(data, depth))
     if data.startswith(TIFF):
         return Stored(*decode_tiff(data, depth))
     decoded = _decode_with_opencv(data)
-    stored = _as_in_png(decoded, data, depth) if data.startswith(PNG) else Stored(decoded)
-    return stored._replace(orientation=orientation_of(data))
+    stored = _as_in_png(decoded, data, depth) if data.startswith(PNG) else Stored(_colours(decoded))
+    return stored._replace(orientation=orientation_of(data), linear=not depth and is_linear(data))
 
 
 def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:
@@ -134,7 +139,9 @@ def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:
     if kind == _PALETTE and depth:
         raise ValueError("its pixels are the colours of a palette (PNG), which are no depth")
     if kind == _GREY_AND_ALPHA:
-        return Stored(decoded[..., :1])
+        unknown = decoded[..., -1] == 0 if depth else None
+        return Stored(decoded[..., :1], unknown=unknown)
+    decoded = _colours(decoded)
     if kind != _GREY:
         return Stored(decoded)
     white = 2**bits - 1
@@ -172,6 +179,11 @@ def _decode_with_opencv(data: bytes) -> NDArray[Any]:
         raise ValueError("it is damaged, or needs more memory than there is")
     if damage := [line for line in said if line.startswith(_DAMAGE) and _HARMLESS not in line]:
         raise ValueError(f"the file is cut short or damaged ({damage[0]})")
+    return decoded
+
+
+def _colours(decoded: NDArray[Any]) -> NDArray[Any]:
+    """Return OpenCV's BGR(A) as RGB, and grey without alpha."""
     if decoded.ndim == 2:
         return decoded
-    return decoded[..., 2::-1] if decoded.shape[2] > 2 else decoded[..., :1]  # BGR(A) to RGB, or grey with alpha
+    return decoded[..., 2::-1] if decoded.shape[2] > 2 else decoded[..., :1]

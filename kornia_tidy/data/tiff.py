@@ -18,20 +18,23 @@ from numpy.typing import NDArray
 
 from kornia_tidy.data.tiff_directories import DESCRIPTION, PHOTOMETRIC, Directory, picture_directories
 from kornia_tidy.data.tiff_segments import JPEG, Layout, decode_segments, layout_of, named
+from kornia_tidy.data.transfer import profile_is_linear
+from kornia_tidy.optics.units import metres_in
 
-ORIENTATION, COLOUR_MAP, EXTRA_SAMPLES, GDAL_METADATA, GDAL_NODATA = 274, 320, 338, 42112, 42113
+ORIENTATION, COLOUR_MAP, EXTRA_SAMPLES, ICC_PROFILE, GDAL_METADATA, GDAL_NODATA = 274, 320, 338, 34675, 42112, 42113
 
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _YCBCR = 0, 1, 2, 3, 6
 _COLOURS = {_WHITE_IS_ZERO: 1, _BLACK_IS_ZERO: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}  # samples without extra ones
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # kinds of alpha: colours are multiplied by the first
 _UNSIGNED, _SIGNED, _FLOAT = 1, 2, 3  # SampleFormat
-_SCALE = re.compile(rb'<Item [^<>]{0,200}role="(scale|offset)"[^<>]{0,200}>([^<>]{1,40})</Item>')
-_CALIBRATION = re.compile(rb"\n(cf|c\d)=([^\n]{1,40})")
+_SCALE = re.compile(rb"<Item [^<>]{0,200}role=[\"'](scale|offset|unittype)[\"'][^<>]{0,200}>([^<>]{1,40})</Item>")
+_CALIBRATION = re.compile(rb"\n(cf|c\d|vunit)=([^\n]{1,40})")
+_NOT_A_NUMBER = re.compile(r"[-+]?1\.#(QNAN|IND)0*")  # as older programs of Windows write it
 
 
 def decode_tiff(
     data: bytes, depth: bool = False
-) -> tuple[NDArray[Any], float | None, NDArray[np.bool_] | None, int, float]:
+) -> tuple[NDArray[Any], float | None, NDArray[np.bool_] | None, int, float, bool]:
     """Decode a TIFF.
 
     Args:
@@ -45,7 +48,8 @@ def decode_tiff(
         unknown: (H, W), True where the file says that nothing was measured: by GDAL's missing value, by a mask, by
             transparency or by a strip or tile that is left out. None if it says so nowhere.
         orientation: 1 to 8 as in EXIF.
-        scale: factor for the numbers in GDAL's or ImageJ's metadata; 1 without one.
+        scale: factor for the numbers in GDAL's or ImageJ's metadata, with the metres in their unit; 1 without one.
+        linear: whether its colour profile says that a picture is linear light.
 
     Raises:
         ValueError: if the file is damaged, of a kind that is not read, or holds several pictures or none.
@@ -82,6 +86,7 @@ def decode_tiff(
         np.logical_or.reduce(unknown) if unknown else None,
         orientation if 1 <= orientation <= 8 else 1,
         scale,
+        not depth and profile_is_linear(directory.stored_bytes(ICC_PROFILE)),
     )
 
 
@@ -126,6 +131,9 @@ def _missing_value(directory: Directory, dtype: np.dtype[Any]) -> Any:
     if GDAL_NODATA not in directory:
         return None
     text = directory.text(GDAL_NODATA).decode("latin-1").strip()
+    if not text:
+        return None
+    text = "nan" if _NOT_A_NUMBER.fullmatch(text) else text
     try:
         value = float(text)
         whole = int(text) if text.lstrip("+-").isdigit() else value  # beyond 2^53 too
@@ -139,10 +147,10 @@ def _missing_value(directory: Directory, dtype: np.dtype[Any]) -> Any:
 
 
 def _scale(directory: Directory) -> float:
-    """Return the factor that GDAL or ImageJ gives for the numbers, 1 if they give none.
+    """Return the metres in the numbers' unit by GDAL or ImageJ, 1 if they do not say it.
 
     Raises:
-        ValueError: if they also give an offset or a curve.
+        ValueError: if they also give an offset or a curve, or a unit of inverse depth.
     """
     if directory.text(DESCRIPTION).startswith(b"ImageJ="):
         given, source = dict(_CALIBRATION.findall(directory.text(DESCRIPTION))), "calibration of ImageJ"
@@ -150,14 +158,16 @@ def _scale(directory: Directory) -> float:
     else:
         given, source = dict(_SCALE.findall(directory.text(GDAL_METADATA))), "GDAL_METADATA"
         changes = [given.get(b"scale", b"1"), given.get(b"offset", b"0")]
+    unit = given.get(b"unittype", given.get(b"vunit", b"")).decode("utf-8", "replace")
     try:
         scale, *others = (float(text) for text in changes)
     except ValueError:
-        raise ValueError(f"the file is damaged: its {source} is no number") from None
+        texts = b", ".join(changes).decode("latin-1")
+        raise ValueError(f"the file is damaged: its {source} gives {texts:.100}, not numbers") from None
     if any(others) or not 0 < scale < math.inf:
         values = b", ".join(b"%s %s" % pair for pair in given.items()).decode("latin-1")
         raise ValueError(f"its numbers are to be changed by {values:.100} ({source}): save the depths themselves")
-    return scale
+    return scale * metres_in(unit)
 
 
 def _palette(directory: Directory, layout: Layout) -> NDArray[Any]:

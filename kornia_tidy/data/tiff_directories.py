@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kornia_tidy.data.picture_header import refuse_raw
+
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 NEW_SUBFILE_TYPE, SUBFILE_TYPE, COLUMNS, ROWS, COMPRESSION, PHOTOMETRIC, SAMPLES = 254, 255, 256, 257, 259, 262, 277
@@ -23,7 +25,7 @@ DESCRIPTION, SUB_DIRECTORIES, CFA_PATTERN, META_MORPH, DNG_VERSION = 270, 330, 3
 
 MOST_DIRECTORIES = 1000
 MOST_FIELDS = 1024
-_MOST_TEXT = 1 << 16  # bytes
+_MOST_BYTES = 1 << 16  # bytes
 _KINDS = {1: "u1", 2: "u1", 3: "u2", 4: "u4", 6: "i1", 7: "u1", 8: "i2", 9: "i4", 13: "u4", 16: "u8", 17: "i8",
           18: "u8"}  # fmt: skip
 _LARGEST = 1 << 62  # for unsigned numbers of 64 bits: beyond any file
@@ -83,19 +85,28 @@ class Directory:
         numbers = self.numbers(tag)
         return int(numbers[0]) if len(numbers) else default
 
-    def text(self, tag: int) -> bytes:
-        """Return the beginning of a text, up to its first zero byte; empty if it is missing."""
+    def stored_bytes(self, tag: int) -> bytes:
+        """Return the beginning of a field of bytes; empty if it is missing or of another type."""
         kind, number, place = self.fields.get(tag, (0, 0, 0))
         if _KINDS.get(kind) != "u1":
             return b""
         if number > (8 if self.big else 4):
             (place,) = self._unpack("Q" if self.big else "I", place)
-        return self.data[place : place + min(number, _MOST_TEXT)].split(b"\0")[0]
+        return self.data[place : place + min(number, _MOST_BYTES)]
+
+    def text(self, tag: int) -> bytes:
+        """Return the beginning of a text, up to its first zero byte; empty if it is missing."""
+        return self.stored_bytes(tag).split(b"\0")[0]
 
     @property
     def reduced(self) -> bool:
         """Whether it is a preview with fewer pixels than another picture of the file."""
         return bool(self.number(NEW_SUBFILE_TYPE, 0) & _REDUCED) or self.number(SUBFILE_TYPE, 0) == _OLD_REDUCED
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.number(ROWS, 0) * self.number(COLUMNS, 0)
 
     @property
     def mask(self) -> bool:
@@ -112,7 +123,8 @@ class Directory:
 def picture_directories(data: bytes) -> tuple[Directory, Directory | None]:
     """Return the directory of the only picture in a TIFF, and that of its mask of valid pixels if it has one.
 
-    Reduced-resolution previews are passed over. Subdirectories are looked at where all directories are previews.
+    Reduced-resolution previews are passed over. Pictures in subdirectories count where all directories are previews,
+    and where they are larger: some cameras leave their preview unmarked.
 
     Raises:
         ValueError: if the file is damaged, holds several pictures or none, or is a camera raw file.
@@ -126,12 +138,19 @@ def picture_directories(data: bytes) -> tuple[Directory, Directory | None]:
         raise ValueError(f"the file is damaged: its BigTIFF header gives offsets of {sizes[0]} bytes, not 8")
     chain = _chain(data, first, [])
     if data[8:10] == b"CR" and not big:
-        _refuse_raw("Canon CR2")
+        refuse_raw("Canon CR2")
     for directory in chain:
         _check_raw(directory)
-    whole = [directory for directory in chain if not directory.reduced and not directory.mask]
-    if not whole:
-        whole = [directory for directory in _below(data, chain) if not directory.reduced and not directory.mask]
+    whole = _pictures(chain)
+    try:
+        below = _below(data, chain)
+    except ValueError:  # what is damaged beside a picture does not matter
+        if not whole:
+            raise
+        below = []
+    for directory in below:
+        _check_raw(directory)
+    whole += [found for found in _pictures(below) if not whole or found.pixels > whole[0].pixels]
     if not whole:
         what = "transparency mask" if all(directory.mask for directory in chain) else "reduced-resolution preview"
         fault = f"NewSubfileType {chain[0].number(NEW_SUBFILE_TYPE, 0)}"
@@ -144,6 +163,10 @@ def picture_directories(data: bytes) -> tuple[Directory, Directory | None]:
     size = [picture.number(tag, 0) for tag in (ROWS, COLUMNS)]
     masks = [d for d in chain if d.mask and not d.reduced and [d.number(tag, 0) for tag in (ROWS, COLUMNS)] == size]
     return picture, masks[0] if masks else None
+
+
+def _pictures(directories: list[Directory]) -> list[Directory]:
+    return [directory for directory in directories if not directory.reduced and not directory.mask]
 
 
 def _chain(data: bytes, place: int, others: list[Directory]) -> list[Directory]:
@@ -169,8 +192,6 @@ def _below(data: bytes, chain: list[Directory]) -> list[Directory]:
     for directory in chain:
         for place in directory.numbers(SUB_DIRECTORIES)[:MOST_DIRECTORIES]:
             below += _chain(data, int(place), below)
-    for directory in below:
-        _check_raw(directory)
     return below
 
 
@@ -190,17 +211,13 @@ def _stacked(picture: Directory) -> int:
 def _check_raw(directory: Directory) -> None:
     for tag, name in ((DNG_VERSION, "DNG"), (CFA_PATTERN, "with a colour filter array")):
         if tag in directory:
-            _refuse_raw(name)
+            refuse_raw(name)
     for tag, values, name in (
         (PHOTOMETRIC, _RAW_PHOTOMETRIC, "photometric interpretation"),
         (COMPRESSION, _RAW_COMPRESSION, "compression"),
     ):
         if (value := directory.number(tag, 1)) in values:
-            _refuse_raw(f"{name} {value}")
-
-
-def _refuse_raw(kind: str) -> None:
-    raise ValueError(f"it is a camera raw file ({kind}): develop it by kornia-tidy raw develop")
+            refuse_raw(f"{name} {value}")
 
 
 def _refuse_stack(count: int) -> None:

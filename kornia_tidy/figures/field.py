@@ -16,7 +16,7 @@ from kornia_tidy.figures.field_measures import (
     heights_to_corner,
     measures_over_field,
 )
-from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, new_figure, open_chart, require_matplotlib
+from kornia_tidy.figures.style import BLUE, FAINT, GREEN, INK, RED, new_figure, open_chart, require_matplotlib, shown
 from kornia_tidy.masks.no_mask import NoMask
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH
@@ -81,7 +81,7 @@ def draw_field(measured: FieldMeasures, airy: float) -> Figure:
     tall = CELL * (rows + 1)
     figure = new_figure(WIDTH, tall + PLOTS)
     words = f"field points right of the axis, pixels of {1e6 * measured.pitch:.3g} µm; each colour about its chief ray"
-    figure.suptitle(f"{measured.lens}: {words}", fontsize=LABEL + 2, color=INK)
+    figure.suptitle(f"{shown(measured.lens)}: {words}", fontsize=LABEL + 2, color=INK)
     above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))
     parts = {
         "PSFs, square root of the light, grey: beyond the window": _psf,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, new_figure, open_chart, require_matplotlib
+from kornia_tidy.figures.style import ACCENT, BLUE, FAINT, INK, new_figure, open_chart, require_matplotlib, shown
 from kornia_tidy.files import error_prefix, read_csv
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _drawn(folder: Path, losses: NDArray[np.float64], name: str, decibels: list[
     right.axvline(plateau, color=ACCENT, linewidth=1, linestyle=(0, (4, 3)))
     for axes, what in ((left, "training loss"), (right, f"{name}, dB")):
         open_chart(axes, LABEL, xlabel="step", ylabel=what)
-    figure.text(0.02, 0.92, f"Learning curve: {folder.name}", fontsize=TITLE, color=INK, weight="bold")
+    figure.text(0.02, 0.92, f"Learning curve: {shown(folder.name)}", fontsize=TITLE, color=INK, weight="bold")
     level = f"within {TOLERANCE:g} dB of it at step {plateau:,} of {steps[-1]:,}"
     if plateau == steps[-1] and len(steps) > 1:
         level = "still rising at the end"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from kornia_tidy.figures.psf_measures import PSFMeasures
-from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, new_figure, open_chart
+from kornia_tidy.figures.style import DEPTH_COLORS, FAINT, INK, new_figure, open_chart, shown
 from kornia_tidy.figures.system_statistics import ring_centres
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def draw_psfs(measured: PSFMeasures, title: str) -> Figure:
     tall = CELL * rows + 0.6
     size = max(8.5, CELL * columns + 2), tall + PLOTS + 0.4
     figure = new_figure(*size)
-    figure.suptitle(title, fontsize=HEADLINE, color=INK, weight="bold")
+    figure.suptitle(shown(title), fontsize=HEADLINE, color=INK, weight="bold")
     above, below = cast("Any", figure.subfigures(2, 1, height_ratios=(tall, PLOTS)))
     _montage(above, measured)
     left, right = below.subplots(1, 2)

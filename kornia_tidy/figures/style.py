@@ -41,6 +41,18 @@ def new_figure(width: float, height: float, layout: Any = "constrained") -> Figu
     return Figure(figsize=(width, height), facecolor="white", layout=layout)
 
 
+def shown(name: str) -> str:
+    r"""Return the name of a file or of a thing as a figure can show it.
+
+    Bytes that are no text become question marks, and a dollar sign begins no formula.
+
+    Example:
+        >>> print(shown("a$b" + chr(0xDCFF)))
+        a\$b?
+    """
+    return name.encode(errors="replace").decode().replace("$", r"\$")
+
+
 def encoded_figure(figure: Figure, dpi: float = 150, format: str = "png") -> bytes:  # noqa: A002 (as matplotlib has it)
     """Return a figure as the bytes of a picture file."""
     picture = BytesIO()

@@ -12,7 +12,7 @@ import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor
 
-from kornia_tidy.data.image_files import read_image
+from kornia_tidy.data.image_files import read_image, read_linear
 from kornia_tidy.lab.calibration.noise.photon_transfer import PhotonTransfer
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.lab.raw.develop import develop
@@ -70,7 +70,7 @@ def read_light(
         tensor(0.2140)
     """
     if raw is None and Path(path).suffix.lower() in PICTURES:
-        picture = read_image(path)
+        picture = read_linear(path) if linear else read_image(path)
         light = picture if linear else rgb_to_linear_rgb(picture.expand(3, -1, -1))[: len(picture)]
         return CaptureLight(light, _as_it_is, {}, sensor)
     raw = RawCapture.open(path) if raw is None else raw

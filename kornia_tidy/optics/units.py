@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Hashable, Sequence
 
@@ -19,6 +20,12 @@ OTHER_FOCUS = 100.0  # times the focus distance or a part of it; a scene that is
 LEAST_MILLIMETRES = 100.0  # m; to this distance a setting is taken for metres, as few lenses focus at 100 mm
 UNITS = ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e-6, "micrometres"), (1e-9, "nanometres"))
 KILOMETRES = (1e3, "kilometres")
+_PREFIXES = (("", "", 1.0), ("k", "kilo", 1e3), ("c", "centi", 1e-2), ("m", "milli", 1e-3), ("u", "micro", 1e-6),
+             ("\u00b5", "micro", 1e-6), ("\u03bc", "micro", 1e-6), ("n", "nano", 1e-9))  # fmt: skip
+_METRES = {f"{short}m": metres for short, _, metres in _PREFIXES}
+_METRES |= {long + metre: metres for _, long, metres in _PREFIXES for metre in ("meter", "metre")}
+_METRES |= {"micron": 1e-6, "in": 0.0254, "inch": 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048}
+_INVERSE_METRES = re.compile(r"1 ?/ ?m(et(er|re)s?)?|m(et(er|re)s?)? ?\^? ?-1|diopt(er|re)s?|dpt")
 
 _TOLD: set[Hashable] = set()  # warnings that were given in this process
 
@@ -36,6 +43,22 @@ def warn_once(told: set[Hashable] | None, key: Hashable, sentence: str, stacklev
     if key not in told:
         told.add(key)
         warnings.warn(sentence, stacklevel=stacklevel)
+
+
+def metres_in(unit: str) -> float:
+    """Return the metres in a unit of length that a file names; 1 for other texts, such as pixels.
+
+    Raises:
+        ValueError: if it is that of inverse depth.
+
+    Example:
+        >>> metres_in("Millimeters"), metres_in("mm"), metres_in("")
+        (0.001, 0.001, 1.0)
+    """
+    unit = unit.strip().lower()
+    if _INVERSE_METRES.fullmatch(unit):
+        raise ValueError(f"its numbers are inverse depth by their unit, {unit!r}: save 1 / depth in its place")
+    return _METRES.get(unit, _METRES.get(unit.removesuffix("s"), 1.0))
 
 
 def check_image(image: Tensor, encoded: bool) -> str | None:

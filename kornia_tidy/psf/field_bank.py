@@ -20,6 +20,7 @@ from kornia_tidy.psf.psf_bank import BankOfPSFs, PSFBank
 from kornia_tidy.psf.pupil import Pupil, gapped_cells, pupil_field
 
 _LEAST, _MOST = 1e-7, 1e-3  # tolerance of the field
+_HEIGHTS = 9  # in the lens's field, where lateral colour is looked at: grids are alike whichever points are asked for
 FEWEST_CELLS = 23  # along a side of the stop, where they are alike
 
 
@@ -241,7 +242,8 @@ def field_psfs(
     """
     phase, pupil = _merged(phase, pupil)
     sensor = Sensor(pixel_pitch, window, min(max(tolerance / 10, _LEAST), _MOST))
-    apart = _lateral_shifts(lens, field, spectrum, pixel_pitch)
+    heights = [(lens.field / pixel_pitch * i / (_HEIGHTS - 1), 0.0) for i in range(_HEIGHTS)]
+    apart = _lateral_shifts(lens, [*field, *heights], spectrum, pixel_pitch)
     screens = [_screens(phase, pupil, factor) for factor in dispersion]
     quadrant, images = mirror_images([(y * pixel_pitch, x * pixel_pitch) for y, x in field])
     parts: list[list[tuple[Tensor, list[Tensor]]]] = [[] for _ in spectrum.plane_weights]
@@ -335,6 +337,7 @@ def _mixing(spectrum: Spectrum, wave: int) -> tuple[list[int], list[tuple[int, i
     return seen, [(n, v, planes[n]) for v, own in enumerate(seen) for n in range(own * basis, (own + 1) * basis)]
 
 
+@on_cpu
 def whole_cells(pupil: Pupil) -> Tensor:
     """Return begin and end of the cells of a mask along either axis in stop radii, (2, N) float64."""
     cells = pupil.amplitude.shape[-1]
@@ -342,6 +345,7 @@ def whole_cells(pupil: Pupil) -> Tensor:
     return torch.stack([begin, begin + 1]) * pupil.cell_pitch
 
 
+@on_cpu
 def _screens(phase: Tensor, pupil: Pupil, dispersion: float) -> list[Screen]:
     """Return the fields in the stop: of whole cells, or of a mask's modulating parts and its gaps."""
     cells = pupil.amplitude.shape[-1]

@@ -130,7 +130,8 @@ def lens_psfs(
         images: F field points as mirror images of these, see :func:`mirror_images`.
         limits: of the lens, see :func:`lens_limits`.
         sensor: pixels, window and tolerance.
-        shifts: of the light along y and x in pixels, for each of V copies of the PSFs, (F, V, 2).
+        shifts: of the light along y and x in pixels, for each of V copies of the PSFs, (F, V, 2). Further rows tell
+            how large shifts may be.
 
     Returns:
         Light in each pixel, (D, V, P, P) for each of F points; that of the whole sensor, (F, D); and the area of

@@ -19,6 +19,7 @@ from kornia_tidy.masks.pixelwise import PixelwiseMask
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.modulator.modulator import DwellTimes, Timeline, timeline_of
 from kornia_tidy.optics.aperture import check_aperture
+from kornia_tidy.optics.default_device import on_cpu
 from kornia_tidy.optics.lens.lens import Lens
 from kornia_tidy.optics.spectrum import REFERENCE_WAVELENGTH, Spectrum
 from kornia_tidy.optics.thin_lens import DefocusRange, ThinLensCamera
@@ -259,7 +260,7 @@ class PSFModel:
         nodes = self.defocus_nodes if defocus is None else defocus
         if field is not None:
             points, tolerance = check_field(field, self.lens), self.fidelity.pixel_tolerance
-            self._warn_if_beyond(points, nodes)
+            self._warn_if_beyond(tuple(points), nodes, spectrum.wavelengths)
             given = self._of_lens(spectrum.flat(), nodes, self.window, points, tolerance)
             return field_psf_bank(*self.states(dtype), **given).with_stray_light(self.fidelity.stray_light)
         bank = self._computed_bank(spectrum.flat(), dtype, nodes)
@@ -332,10 +333,11 @@ class PSFModel:
         bank = bank if spectrum.basis else not_negative(bank)
         return self._finished(bank, stray_light, spectrum, field)
 
-    def _warn_if_beyond(self, points: Sequence[tuple[float, float]], nodes: Sequence[float]) -> None:
+    @on_cpu
+    def _warn_if_beyond(self, points: Points, nodes: Sequence[float], wavelengths: Sequence[float]) -> None:
         lens = cast("Lens", self.lens)
         heights = torch.tensor([math.hypot(*point) * self.camera.pixel_pitch for point in points], dtype=torch.float64)
-        for wavelength in (min(self._sampled.wavelengths), max(self._sampled.wavelengths)):
+        for wavelength in {min(wavelengths), max(wavelengths)}:
             lens.warn_if_beyond(heights, torch.tensor(nodes, dtype=torch.float64), wavelength)
 
     def _finished(
@@ -403,7 +405,7 @@ class PSFModel:
             else:
                 rows, columns = ((size[i] - 1) / 2 for i in (0, 1))
                 corners = [(center[0] + y * rows, center[1] + x * columns) for y in (-1, 1) for x in (-1, 1)]
-                self._warn_if_beyond(corners, camera.defocus_range)
+                self._warn_if_beyond(tuple(corners), camera.defocus_range, self._sampled.wavelengths)
                 given = camera.defocus_range, min(self._sampled.wavelengths), camera.pixel_pitch, self.window / 4
                 field = field_nodes(size, center, lens, *given, tolerance, masks)
             known[asked] = field
@@ -549,7 +551,7 @@ class PSFModel:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
-            if self.lens is None and self.aperture is not None and self._amplitude is not None:
+            if self.lens is None and self._amplitudes_differ:
                 weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
@@ -578,7 +580,7 @@ class PSFModel:
     def state_weights(self, dtype: torch.dtype) -> Tensor:
         """Return the share of the exposure of each state that the modulator shows, (S,)."""
         weights = self.states(dtype)[1]
-        if self.lens is None or self._amplitude is None or self.state is not None or self.moment is not None:
+        if self.lens is None or not self._amplitudes_differ or self.state is not None or self.moment is not None:
             return weights
         return weights * self.relative_light(dtype)
 
@@ -825,6 +827,11 @@ class PSFModel:
                 )
         return amplitude
 
+    @property
+    def _amplitudes_differ(self) -> bool:
+        """Whether each mask has its own amplitude."""
+        return self.aperture is not None and (own := self._amplitude) is not None and own.ndim == 3
+
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
 
@@ -846,7 +853,10 @@ class PSFModel:
         if channels == len(self.spectrum.weights):
             return self._sampled
         if channels == 1:
-            return Spectrum.monochrome()
+            grey = Spectrum.monochrome()
+            if self.lens is not None:  # its table need not hold that
+                self._warn_if_beyond(AXIS, self.lens.defocus_range, grey.wavelengths)
+            return grey
         raise ValueError(
             f"image must have {len(self.spectrum.weights)} channels as the spectrum has, or 1, got {channels}{remedy}"
         )

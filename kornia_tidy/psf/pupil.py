@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from kornia_tidy.checks import check_values
 from kornia_tidy.kernels.precision import has_float64
 from kornia_tidy.masks.base import MASK_SPAN
 from kornia_tidy.optics.aperture import circular_aperture, light_through
@@ -109,7 +110,7 @@ def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: 
         fill_factor: share of the area of each mask pixel that modulates.
 
     Raises:
-        ValueError: if the aperture is not finer by a whole factor.
+        ValueError: if the aperture is not finer by a whole factor, or on the meta device.
 
     Example:
         >>> pupil_over((5, 23, 31), None, 1.0).amplitude.shape
@@ -117,6 +118,7 @@ def pupil_over(mask_shape: Sequence[int], aperture: Tensor | None, fill_factor: 
     """
     size = min(mask_shape[-2:])
     amplitude = circular_aperture(size, MASK_SPAN / size) if aperture is None else aperture
+    check_values("aperture", amplitude)
     if amplitude.shape[-1] % size:
         raise ValueError(
             f"aperture must have a whole number of cells for each of the {size} mask pixels, got "

@@ -140,11 +140,15 @@ def camera_of(chain: OpticsPipeline) -> TiDyOptics:
 
 
 class TestBehindALens(BaseTester):
-    @pytest.mark.parametrize("random", [False, True])
+    @pytest.mark.parametrize(("random", "measured"), [(False, False), (True, False), (False, True), (True, True)])
     @torch.no_grad()
-    def test_feature_a_crop_sees_what_the_whole_capture_has_there(self, random):
+    def test_feature_a_crop_sees_what_the_whole_capture_has_there(self, random, measured):
         optics = lens_camera(field_center=(430.0, -500.0))
         optics.sensor = None
+        if measured:
+            places = [(0.0, 0.0), *((430.0 + y, -500.0 + x) for y in (-60, 0, 60) for x in (-70, 0, 70))]
+            bank, optics.lens = optics.psf_bank(field=places), None
+            optics = optics.with_bank(bank)
         whole = optics(*lens_scene())
         geometry = K.RandomCrop((64, 64))
         chain = OpticsPipeline(geometry, RandomTiDyOptics(optics, p=1.0) if random else optics)

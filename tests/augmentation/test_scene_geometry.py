@@ -30,19 +30,20 @@ class TestSceneGeometry(BaseTester):
             [K.RandomResizedCrop((32, 41))],
             [K.RandomCrop((32, 41)), K.Resize((64, 82))],
             [K.RandomAffine(20, (0.1, 0.1), (0.8, 1.2), p=1.0)],
+            [K.RandomCrop((55, 71)), K.RandomPerspective(0.4, p=1.0)],
         ],
     )
     def test_feature_crops_lie_in_the_field_where_their_content_says(self, augmentations):
         """The image holds its own coordinates from the axis; in the crop they grow by those of a pixel."""
-        y, x = torch.meshgrid(torch.arange(90.0), torch.arange(121.0), indexing="ij")
-        image = torch.stack([y - 44.5 + 7, x - 60 - 20]).expand(3, 2, 90, 121)
+        y, x = torch.meshgrid(torch.arange(90.0).double(), torch.arange(121.0).double(), indexing="ij")
+        image = torch.stack([y - 44.5 + 307, x - 60 - 420]).expand(3, 2, 90, 121)
         geometry = SceneGeometry(*augmentations)
         torch.manual_seed(1)
         out = geometry(image, torch.ones(3, 1, 90, 121)).image
-        found = geometry.field_center(image, out, (7.0, -20.0))
+        found = geometry.field_center(image, out, (307.0, -420.0))
         row, column = ((side - 1) // 2 for side in out.shape[-2:])
-        here = out[..., row, column]
-        steps = torch.stack([out[..., row + 1, column] - here, out[..., row, column + 1] - here], -1)
+        here, beside = out[..., row, column], out[..., row - 1 : row + 2, column - 1 : column + 2]
+        steps = torch.stack([beside[..., 2, 1] - beside[..., 0, 1], beside[..., 1, 2] - beside[..., 1, 0]], -1) / 2
         offset = torch.tensor([(side - 1) / 2 - (side - 1) // 2 for side in out.shape[-2:]])
         expected = torch.linalg.solve(steps, here[..., None])[..., 0] + offset
         self.assert_close(found.float(), expected, rtol=0, atol=2e-2)

@@ -87,6 +87,11 @@ class TestImageTypes(BaseTester):
             image_tensor(torch.ones(3, 4, 4, dtype=torch.int64))
         with pytest.raises(ValueError, match=r"mode L, RGB or I;16, got RGBA: convert\('RGB'\)"):
             image_tensor(Image.new("RGBA", (4, 4)))
+        with pytest.raises(ValueError, match=r"depth must be a PIL image in mode L, I;16, I or F, got RGBA$"):
+            depth_tensor(Image.new("RGBA", (4, 4)))
+        with pytest.raises(TypeError, match="image must hold numbers, got object"):
+            image_tensor(np.array([[None]]))
+        self.assert_close(depth_tensor(Image.new("I;16B", (1, 1), 700), 1e-3), torch.full((1, 1, 1), 0.7))
         with pytest.raises(ValueError, match=r"must be \(H, W\), \(H, W, C\) or \(B, H, W, C\), got \(4,\)"):
             image_tensor(np.zeros(4))
         with pytest.raises(ValueError, match="depth must have one channel, got 3"):

@@ -25,13 +25,15 @@ class TestReadCalibration(BaseTester):
     @pytest.mark.parametrize(
         ("name", "text", "sentence"),
         [
-            ("calib.txt", TEXT.replace("baseline", "base"), "has cam0=.*, baseline= and doffs="),
+            ("calib.txt", TEXT.replace("baseline", "base"), "has cam0=.*, baseline= and doffs=, found cam0, "),
             ("calib.txt", TEXT.replace(" 0 0 1 ", " 0 0 "), "Middlebury's calibration has cam0="),
             ("calib.txt", TEXT.replace("176.252", "-176.252"), "baseline_m must be positive and finite, got -0.176"),
             ("calib.txt", TEXT.replace("176.252", "1-2"), "could not convert"),
+            ("calib.txt", TEXT.replace("176.252", "176,252"), r"'baseline= 176,252' is no number, with a point"),
+            ("calib.txt", TEXT.replace("53.271", "53.271 px").replace("\n", "\r"), "'doffs= 53.271 px' is no number"),
             ("calib.txt", TEXT.replace("53.271", "1e999"), "doffs_px must be positive and finite, got inf"),
             ("a.json", "[1]", "a calibration holds some of focal_px, baseline_m, doffs_px, scale"),
-            ("a.json", '{"focal": 1}', "a calibration holds some of focal_px"),
+            ("a.json", '{"focal": 1}', "a calibration holds some of focal_px.*got {'focal': 1}"),
             ("calib.txt", TEXT + "\nbaseline=1\n", "it gives an entry twice: .*baseline, .*baseline"),
             ("a.json", '{"scale": "0.001"}', "scale must be a number, got '0.001'"),
             ("a.json", '{"scale": true}', "scale must be a number, got True"),

@@ -59,6 +59,8 @@ UNCLEAR = {
     "a picture": ({"R": DEPTH, "G": OTHER, "B": DEPTH}, "its red, green and blue differ: of B, G, R write only one"),
     "vectors": (colours("Normal.", names="XYZ"), "none is named for it: of Normal.X, Normal.Y, Normal.Z"),
     "mist": ({**colours(), "Mist.Z": OTHER}, "none is named for it"),
+    "only mist": ({"View.Mist.Z": OTHER}, "none is named for it: of View.Mist.Z"),
+    "only alpha": ({"A": OTHER}, "none is named for it: of A"),
 }
 
 

@@ -24,10 +24,7 @@ def root(tmp_path_factory):
 class TestFlyingThings3D(BaseTester):
     @pytest.mark.parametrize(
         ("options", "first", "length"),
-        [
-            ({}, "TRAIN/A/0000/left/0006", 8),
-            ({"split": "test"}, "TEST/A/0000/left/0006", 6),
-        ],
+        [({}, "TRAIN/A/0000/left/0006", 8), ({"split": "test"}, "TEST/A/0000/left/0006", 6)],
     )
     def test_cardinality(self, root, options, first, length):
         data = FlyingThings3D(root, **options)

@@ -54,6 +54,7 @@ def combinations():
     for number, (white, (name, channels, colours)) in enumerate(itertools.product(MAXIMA, TUPLES)):
         rows, columns = SIZES[number % len(SIZES)]
         values = random.integers(0, white + 1, (rows, columns, channels))
+        values[..., colours:] = values[..., colours:].clip(min=1)  # visible
         kinds = "".join(f"TUPLTYPE {part}\n" for part in ([name] if name else []))
         lines = (
             f"WIDTH {columns}\n",

@@ -51,10 +51,7 @@ class TestDecodeNpy(BaseTester):
         [
             ("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }", "promises 8000000000000 bytes"),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': (1, 1), }", "promises 8 bytes of values, there are 16"),
-            (
-                "{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 2), }",
-                "does not tell data type",
-            ),
+            ("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 2), }", "does not tell data type"),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': (2", "does not tell data type"),
             ("{'descr': '<f8', 'fortran_order': Tr\xe9e, 'shape': (2,), }", "does not tell data type"),
             ("{'descr': '<f8', 'fortran_order': False, 'shape': " + "(" * 9000, "does not tell data type"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import struct
+import warnings
 import zlib
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 from PIL import Image
 
 from kornia_tidy.data import read_depth, read_image
-from kornia_tidy.data.picture_header import OTHERS
+from kornia_tidy.data.image_files import read_linear
+from kornia_tidy.data.picture_header import OTHERS, RAW
 from tests.base import BaseTester
 
 ROWS, COLUMNS = 5, 9
@@ -64,6 +66,28 @@ def jpeg_with(marker, bits=8):
     return data[: place + 1] + bytes((marker,)) + data[place + 2 : place + 4] + bytes((bits,)) + data[place + 5 :]
 
 
+def chunks(*more):
+    return png(np.full((ROWS, COLUMNS, 3), 99), 8, 2, *more)
+
+
+def profiled(kind, curve):
+    """A file with an ICC profile of one tone curve, which Pillow embeds without looking at it."""
+    profile = bytes(128) + struct.pack(">I4sII", 1, b"gTRC", 144, len(curve)) + curve
+    file = io.BytesIO()
+    Image.new("RGB", (COLUMNS, ROWS), (99, 99, 99)).save(file, kind, icc_profile=profile)
+    return file.getvalue()
+
+
+CURVES = [  # one identity in five forms, and sRGB
+    b"curv" + bytes(4) + struct.pack(">IHH", 2, 0, 65535),
+    b"curv" + bytes(8),
+    b"curv" + bytes(4) + struct.pack(">IH", 1, 256),
+    b"curv" + bytes(4) + struct.pack(">I256H", 256, *range(0, 65536, 257)),
+    b"para" + bytes(4) + struct.pack(">HHi", 0, 0, 1 << 16),
+    b"para" + bytes(4) + struct.pack(">HH5i", 3, 0, 157286, 62119, 3417, 5072, 2651),
+]
+FORMATS = ("PNG", "TIFF", "JPEG", "WEBP")
+GAMMA = b"gAMA", struct.pack(">I", 100_000)
 GREY = b"".join(bytes((level, level, level, 0)) for level in range(256))
 REFUSED = {
     "animated PNG": (lambda: animated("PNG"), "it is an animated PNG"),
@@ -77,7 +101,7 @@ REFUSED = {
     "JPEG in BMP": (lambda: bmp(24, 4, jpeg()), "a BMP of 24 bits a pixel with compression 4"),
     "10-bit BMP": (
         lambda: bmp(32, 3, bytes(32), b"", struct.pack("<III", 0x3FF00000, 0xFFC00, 0x3FF)),
-        "a BMP whose colours lie in other bits",
+        "in other bits",
     ),
 }
 
@@ -92,7 +116,7 @@ class TestPictureKinds(BaseTester):
         depth, valid = read_depth(path, 0.5)
         np.testing.assert_array_equal(valid[0], values[..., 0] > 0)
         np.testing.assert_array_equal(depth[valid], 0.5 * values[values > 0])
-        np.testing.assert_allclose(read_image(path)[0], values[..., 0] / (2**bits - 1), atol=1e-6)
+        np.testing.assert_allclose(read_linear(path)[0], values[..., 0] / (2**bits - 1), atol=1e-6)
 
     @pytest.mark.parametrize("bits", [1, 4, 8, 16])
     def test_feature_a_transparent_grey_level_is_unknown_depth(self, bits, tmp_path):
@@ -117,11 +141,48 @@ class TestPictureKinds(BaseTester):
         np.testing.assert_array_equal(read_depth(path).depth[0], twelve[..., 0])
 
     @pytest.mark.parametrize("bits", [8, 16])
-    def test_feature_grey_with_alpha_is_grey(self, bits, tmp_path):
+    def test_feature_grey_with_alpha_is_grey_and_transparent_depth_is_unknown(self, bits, tmp_path):
         values = np.random.default_rng(0).integers(1, 2**bits - 1, (ROWS, COLUMNS, 2))
-        (tmp_path / "a.png").write_bytes(png(values, bits, 4))
-        np.testing.assert_array_equal(read_depth(tmp_path / "a.png").depth[0], values[..., 0])
-        np.testing.assert_allclose(read_image(tmp_path / "a.png")[0], values[..., 0] / (2**bits - 1), atol=1e-6)
+        values[::2, :, 1] = 0
+        head = f"P7 \nWIDTH {COLUMNS}\nHEIGHT {ROWS}\nDEPTH 2\nMAXVAL {2**bits - 1}\nTUPLTYPE GRAYSCALE_ALPHA\nENDHDR\n"
+        pam = head.encode() + values.astype(f">u{bits // 8}").tobytes()
+        for data in (png(values, bits, 4), pam):
+            (tmp_path / "a").write_bytes(data)
+            depth, valid = read_depth(tmp_path / "a")
+            np.testing.assert_array_equal(valid[0], values[..., 1] > 0)
+            np.testing.assert_array_equal(depth[valid], values[1::2, :, 0].ravel())
+            np.testing.assert_allclose(read_image(tmp_path / "a")[0], values[..., 0] / (2**bits - 1), atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("linear", "data"),
+        [(True, chunks(GAMMA)), (True, chunks((b"cICP", bytes((1, 8, 0, 1))))),
+         *((True, profiled("PNG", curve)) for curve in CURVES[:-1]),
+         *((True, profiled(kind, CURVES[0])) for kind in FORMATS),
+         *((False, profiled(kind, CURVES[-1])) for kind in FORMATS), (False, chunks(GAMMA, (b"sRGB", b"\0"))),
+         (False, chunks((b"cICP", bytes((1, 13, 0, 1))), GAMMA)), (False, chunks((b"gAMA", b"\0\0\xb1\x8f")))],
+    )  # fmt: skip
+    def test_feature_linear_light_is_told_unless_it_is_asked_for(self, linear, data, tmp_path):
+        (tmp_path / "a").write_bytes(data)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            np.testing.assert_allclose(read_linear(tmp_path / "a") * 255, 99, atol=2)
+            assert not told
+            np.testing.assert_allclose(read_image(tmp_path / "a") * 255, 99, atol=2)
+        assert [str(warning.message).count("give color_space='linear'") for warning in told] == [1] * linear
+
+    @pytest.mark.parametrize(
+        ("chunk", "sentence"),
+        [((9, 16, 0, 1), r"encoded by PQ \(transfer characteristics 16\).* view transform"),
+         ((9, 18, 0, 1), "encoded by HLG"), ((1, 13, 0, 0), r"do not span the whole range \(cICP")],
+    )  # fmt: skip
+    def test_exception_a_picture_of_video_but_not_depth(self, chunk, sentence, tmp_path):
+        values, path = np.full((ROWS, COLUMNS, 1), 99), tmp_path / "a"
+        path.write_bytes(png(values, 8, 0, (b"cICP", bytes(chunk)), GAMMA))
+        with pytest.raises(ValueError, match=sentence):
+            read_image(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            np.testing.assert_array_equal(read_depth(path).depth, 99)
 
     @pytest.mark.parametrize("bits", [1, 2, 4, 8])
     @pytest.mark.parametrize("alpha", [(), ((b"tRNS", bytes((0, 128))),)])
@@ -138,7 +199,8 @@ class TestPictureKinds(BaseTester):
     def test_feature_colours_keep_their_numbers_and_alpha_is_dropped(self, bits, kind, tmp_path):
         values = np.random.default_rng(0).integers(0, 2**bits, (ROWS, COLUMNS, 3 if kind == 2 else 4))
         first = struct.pack(">HHH", *values[0, 0, :3])
-        for chunks in ((), ((b"tRNS", first),) if kind == 2 else ((b"bKGD", first),)):
+        still = b"acTL", struct.pack(">II", 1, 0)  # an animation of one picture
+        for chunks in ((), ((b"tRNS", first),) if kind == 2 else ((b"bKGD", first), still)):
             (tmp_path / "a.png").write_bytes(png(values, bits, kind, *chunks))
             found = read_image(tmp_path / "a.png").permute(1, 2, 0)
             np.testing.assert_allclose(found, values[..., :3] / (2**bits - 1), atol=1e-6)
@@ -152,35 +214,34 @@ class TestPictureKinds(BaseTester):
             read(tmp_path / "a")
 
     @pytest.mark.parametrize(
-        "data",
+        ("data", "error"),
         [
-            bmp(1, 0, bytes((0xA0, 0, 0, 0, 0x50, 0, 0, 0)), bytes(4) + b"\xff\xff\xff\0"),
-            bmp(4, 0, bytes((0x12, 0x34, 0, 0, 0x56, 0x78, 0, 0)), PALETTE[:64].tobytes()[:64]),
-            bmp(8, 0, bytes(range(8)), GREY),
-            bmp(8, 1, bytes((2, 7, 2, 9, 0, 0, 4, 200, 0, 1)), GREY),
-            bmp(4, 2, bytes((4, 0x12, 0, 0, 4, 0x34, 0, 1)), GREY[: 4 * 16]),
-            bmp(24, 0, bytes(range(24))),
-            bmp(32, 0, bytes(range(32))),
-            bmp(32, 3, bytes(range(32)), b"", struct.pack("<III", 0xFF0000, 0xFF00, 0xFF)),
+            (bmp(1, 0, bytes((0xA0, 0, 0, 0, 0x50, 0, 0, 0)), bytes(4) + b"\xff\xff\xff\0"), 0),
+            (bmp(4, 0, bytes((0x12, 0x34, 0, 0, 0x56, 0x78, 0, 0)), PALETTE[:64].tobytes()[:64]), 0),
+            (bmp(8, 0, bytes(range(8)), GREY), 0),
+            (bmp(8, 1, bytes((2, 7, 2, 9, 0, 0, 4, 200, 0, 1)), GREY), 0),
+            (bmp(4, 2, bytes((4, 0x12, 0, 0, 4, 0x34, 0, 1)), GREY[: 4 * 16]), 0),
+            (bmp(24, 0, bytes(range(24))), 0),
+            (bmp(32, 0, bytes(range(32))), 0),
+            (bmp(32, 3, bytes(range(32)), b"", struct.pack("<III", 0xFF0000, 0xFF00, 0xFF)), 0),
+            *(
+                (jpeg(**given), 4)
+                for given in ({"mode": "L"}, {"progressive": True}, {"keep_rgb": True}, {"subsampling": 2})
+            ),
         ],
-        ids=["1", "4", "8", "RLE8", "RLE4", "24", "32", "masks"],
+        ids=["1", "4", "8", "RLE8", "RLE4", "24", "32", "masks", "JPEG", "progressive", "RGB JPEG", "subsampled"],
     )
-    def test_feature_bmp_as_pillow_reads_it(self, data, tmp_path):
-        (tmp_path / "a.bmp").write_bytes(data)
+    def test_feature_bmp_and_jpeg_as_pillow_reads_them(self, data, error, tmp_path):
+        """Decoders of JPEG round in their own ways."""
+        (tmp_path / "a").write_bytes(data)
         theirs = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-        np.testing.assert_allclose(
-            read_image(tmp_path / "a.bmp").expand(3, -1, -1).permute(1, 2, 0) * 255, theirs, atol=1e-4
-        )
+        found = read_image(tmp_path / "a").expand(3, -1, -1).permute(1, 2, 0) * 255
+        np.testing.assert_allclose(found, theirs, atol=error + 1e-4)
 
-    @pytest.mark.parametrize("options", [{"mode": "L"}, {"progressive": True}, {"keep_rgb": True}, {"subsampling": 2}])
-    def test_feature_jpeg_as_pillow_reads_it(self, options, tmp_path):
-        (tmp_path / "a.jpg").write_bytes(data := jpeg(**options))
-        theirs = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-        found = read_image(tmp_path / "a.jpg").expand(3, -1, -1).permute(1, 2, 0) * 255
-        np.testing.assert_allclose(found, theirs, atol=4)  # decoders of JPEG round in their own ways
-
-    @pytest.mark.parametrize(("place", "beginning", "name"), OTHERS)
+    @pytest.mark.parametrize(("place", "beginning", "name"), [*OTHERS, *RAW])
     def test_exception_other_formats_are_named(self, place, beginning, name, tmp_path):
         (tmp_path / "a").write_bytes(bytes(place) + beginning + bytes(99))
-        with pytest.raises(ValueError, match=f"it is {name}, not an image in a known format: PNG, "):
+        raw = rf"a camera raw file \({name}\): develop it by kornia-tidy raw develop"
+        other = f"{name}, not an image in a known format: PNG, "
+        with pytest.raises(ValueError, match=f"it is {raw if (place, beginning, name) in RAW else other}"):
             read_image(tmp_path / "a")

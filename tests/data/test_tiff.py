@@ -117,7 +117,8 @@ class TestMissingValues(BaseTester):
         [(32, 3, b"-3.4028234663852886e+38", np.finfo("f4").min), (32, 3, b"-3.40282346639e+38", np.finfo("f4").min),
          (32, 3, b"0.1", np.float32(0.1)), (32, 3, b"inf", np.inf), (16, 1, b"65535", 65535),
          (16, 1, b"65535.0", 65535),
-         (16, 2, b"32767", 32767), (64, 1, b"9007199254740993", 2**53 + 1), (16, 3, b" 1e3\n", 1000)],
+         (16, 2, b"32767", 32767), (64, 1, b"9007199254740993", 2**53 + 1), (16, 3, b" 1e3\n", 1000),
+         (32, 3, b"-1.#QNAN", np.nan)],
     )  # fmt: skip
     def test_feature_value_of_gdal(self, bits, kind, text, value, tmp_path):
         """Compared in the data type of the file, as GDAL does."""
@@ -127,19 +128,22 @@ class TestMissingValues(BaseTester):
         valid = read_depth(tmp_path / "a.tif").valid[0].numpy()
         assert np.argwhere(~valid).tolist() == [[1, 2]]
 
-    def test_feature_factor_of_gdal_is_told(self, tmp_path):
-        xml = b'<GDALMetadata><Item name="SCALE" sample="0" role="scale">0.001</Item></GDALMetadata>\0'
-        DEPTH.fields[42112] = 2, xml
-        (tmp_path / "a.tif").write_bytes(tiff(DEPTH))
+    @pytest.mark.parametrize(
+        ("tag", "text"),
+        [(42112, b'<Item name="SCALE" sample="0" role="scale">0.001</Item>'),
+         (42112, b"<Item name='UNITTYPE' sample='0' role='unittype'>mm</Item>"),
+         (270, b"ImageJ=1.5\nimages=1\ncf=0\nc0=0\nc1=.1\nvunit=cm\n")],
+    )  # fmt: skip
+    def test_feature_the_unit_of_gdal_and_imagej_is_told(self, tag, text, tmp_path):
+        (tmp_path / "a.tif").write_bytes(tiff(Page(DEPTH.values, 16, fields={tag: (2, text + b"\0")})))
         read_depth(tmp_path / "a.tif", 0.001)
         with pytest.warns(UserWarning, match=r"its numbers are to be multiplied by 0.001, and scale is 1"):
             read_depth(tmp_path / "a.tif")
-        del DEPTH.fields[42112]
 
     @pytest.mark.parametrize(
         ("tag", "text", "sentence"),
         [(42112, b'<Item name="OFFSET" sample="0" role="offset">-5</Item>', r"changed by offset -5 \(GDAL_METADATA\)"),
-         (42112, b'<Item name="SCALE" sample="0" role="scale">x</Item>', "its GDAL_METADATA is no number"),
+         (42112, b'<Item name="SCALE" sample="0" role="scale">x</Item>', "its GDAL_METADATA gives x, 0, not numbers"),
          (270, b"ImageJ=1.5\nimages=1\ncf=0\nc0=-32768.0\nc1=1.0\n",
           r"changed by cf 0, c0 -32768.0, c1 1.0 \(calibration"),
          (270, b"ImageJ=1.5\nimages=1\ncf=20\n", "changed by cf 20"),
@@ -179,10 +183,20 @@ class TestRefused(BaseTester):
             decoded(tiff(Page(RGB, **{"photometric": 2} | page)))
         assert "damaged" not in str(caught.value)
 
-    def test_exception_a_raw_file_with_its_picture_below_a_preview(self):
-        raw = Page(RGB[..., :1], photometric=32803)
+    @pytest.mark.parametrize("mark", [None, (4, [0]), (4, [1])])
+    def test_exception_a_picture_below_its_preview(self, mark):
+        """Marked as a preview or not."""
+        raw, small = Page(RGB[..., :1], photometric=32803), RGB[::4, ::4]
         with pytest.raises(ValueError, match=r"it is a camera raw file .* kornia-tidy raw develop"):
-            decoded(tiff(Page(RGB[::4, ::4], photometric=2, fields={254: (4, [1])}, below=[raw])))
+            decoded(tiff(Page(small, photometric=2, fields={254: mark}, below=[raw])))
+        picture = tiff(Page(small, photometric=2, fields={254: mark}, below=[Page(RGB, photometric=2)]))
+        if mark == (4, [1]):
+            assert np.array_equal(decoded(picture).values, RGB)
+            return
+        with pytest.raises(ValueError, match=r"it holds 2 pictures \(pages\)"):
+            decoded(picture)
+        damaged = Page(RGB, photometric=2, fields={254: mark, 330: (4, [10**6])})
+        assert np.array_equal(decoded(tiff(damaged)).values, RGB)
 
     @pytest.mark.parametrize(
         ("damage", "sentence"),

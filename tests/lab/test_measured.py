@@ -11,13 +11,7 @@ from kornia_tidy import PSFBank, SensorNoise, ThinLensCamera
 from kornia_tidy.figures.measured_psfs import draw_measured
 from kornia_tidy.lab.calibration.psf import MeasuredPSFs, PointReport
 from kornia_tidy.lab.capture_file import CaptureLight
-from kornia_tidy.lab.measured import (
-    check_capture,
-    closed_form_system,
-    measured_settings,
-    takes_psfs,
-    with_measurements,
-)
+from kornia_tidy.lab.measured import check_capture, closed_form_system, measured_settings, takes_psfs, with_measurements
 from kornia_tidy.psf import FieldBank
 from kornia_tidy.reconstruction.hub import from_pretrained, save_pretrained
 from kornia_tidy.reconstruction.light_head import LightHead, reconstruct_light

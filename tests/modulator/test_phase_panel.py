@@ -12,13 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from kornia_tidy.modulator.phase_panel import (
-    GreyLevels,
-    PixelCrosstalk,
-    StrokeError,
-    crosstalk_kernel,
-    nearest_level,
-)
+from kornia_tidy.modulator.phase_panel import GreyLevels, PixelCrosstalk, StrokeError, crosstalk_kernel, nearest_level
 from tests.base import BaseTester
 
 
@@ -70,10 +64,7 @@ class TestGreyLevels(BaseTester):
         assert efficiency == pytest.approx(np.sinc(2.0**-bits) ** 2, abs=5e-3)
 
     @settings(max_examples=100)
-    @given(
-        levels=st.lists(st.floats(0, 9), min_size=1, max_size=20),
-        wanted=st.floats(-30, 30),
-    )
+    @given(levels=st.lists(st.floats(0, 9), min_size=1, max_size=20), wanted=st.floats(-30, 30))
     def test_feature_the_nearest_level_is_chosen_whatever_their_order(self, levels, wanted):
         phases = torch.tensor(levels, dtype=torch.float64)
         target = torch.tensor(wanted, dtype=torch.float64)

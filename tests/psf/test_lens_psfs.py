@@ -185,10 +185,11 @@ class TestLensPSFs(BaseTester):
     @torch.no_grad()
     def test_feature_a_place_has_the_same_bits_whatever_others_are_asked_for(self):
         """Mirrored places share their points in the stop, and places that are asked for twice do not."""
-        lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(530e-9,), field=6e-3)
+        lens = Lens.from_prescription(symmetric_pair(), 8.0, 0.5, wavelengths=(490e-9, 650e-9), field=6e-3)
+        white = Spectrum((490e-9, 650e-9), ((1.0, 1.0),))  # colours that lie farther apart towards the corner
         field = [(-300.0, 500.0), (0.0, 500.0), (300.0, -500.0), (0.0, 0.0), (300.0, 500.0), (0.0, -500.0), (0.0, 0.0)]
         for seen in (lens, lens.with_masks_off_stop(20.0)):
-            optics = model(seen, random_mask(7, 2), modulator=DwellTimes((3, 1)))
+            optics = model(seen, random_mask(7, 2), modulator=DwellTimes((3, 1)), spectrum=white)
             together = optics.psf_bank(defocus=[3.0, -8.0], field=field).psfs
             for place, psfs in zip(field, together, strict=True):
                 assert torch.equal(optics.psf_bank(defocus=[3.0, -8.0], field=[place]).psfs[0], psfs)

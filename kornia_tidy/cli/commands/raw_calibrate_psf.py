@@ -176,11 +176,11 @@ class CalibratePsf:
 
     def _read(self, path: str, calibration: PhotonTransfer | None) -> Picture:
         """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
-        from kornia_tidy.data.image_files import SUFFIXES, read_image
+        from kornia_tidy.data.image_files import SUFFIXES, read_linear
         from kornia_tidy.lab.calibration.psf.point_files import planes_of_tile
 
         if Path(path).suffix.lower() in SUFFIXES:
-            return read_image(path), None
+            return read_linear(path), None
         raw = self.dump.open(path)
         if calibration is not None:
             calibration.check_taken_alike(raw, path)

@@ -18,11 +18,13 @@ _UNITS = {
     "milliradians": r"(?<![a-z])(mrad|milliradians?)(?![a-z])",
     "degrees": r"((?<![a-z])(deg|degrees?)(?![a-z])|°)(?!\s*(c|celsius)\b)",
     "pi": r"(?<![a-z0-9.])(?<!2 )(pi|π)(?![a-z])",
-    "waves": r"(?<![a-z])(waves?|cycles?|turns?)(?![a-z])|(?<![0-9.])2 ?(pi|π)(?![a-z])|[(\[/] ?(λ|lambda) ?([)\]]|$)",
+    "waves": r"(?<![a-z])(waves?|cycles?|turns?|revolutions?)(?![a-z])|(?<![0-9.])2 ?(pi|π)(?![a-z])"
+    r"|[(\[/] ?(λ|lambda|wavelengths?) ?([)\]]|$)",
 }
-_PHASE = r"phase|phi(?![a-z])|φ|retard|modulation|shift"
+_PHASE = r"phase|phi(?![a-z])|φ|retard|modulation|shift|opd(?![a-z])|opl(?![a-z])"
 _OTHER_UNITS = re.compile(
-    rf"(?:{_PHASE})[^,;\t(\[]*[(\[] ?(nm|[uµμ]m|%|nanomet\w+|micromet\w+|percent|v|volts?) ?[)\]]"
+    rf"(?:{_PHASE})[^,;\t(\[]*[(\[] ?(nm|[uµμ]m|%|nanomet\w+|micromet\w+|percent|v|volts?|gon|grad|gradians?|arcmin\w*"
+    r"|[^)\]]*/ ?\d+ ?(?:pi|π)?) ?[)\]]"
 )
 _FORM = "a response has one phase for each grey level, or two columns, level and phase"
 

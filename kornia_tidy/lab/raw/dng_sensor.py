@@ -197,6 +197,9 @@ def _sample_kind(directory: Directory) -> tuple[int, bool, int]:
         raise ValueError(
             f"its picture is compressed by {name or f'the unknown method {compression}'}, not decoded here"
         )
+    for tag, name in tags.INTERLEAVED.items():
+        if (factors := directory.whole_numbers(tag)) and set(factors) != {1}:
+            raise ValueError(f"its pixels are interleaved, which cannot be decoded ({name} {_listed(factors)})")
     if len(set(bits)) > 1:
         raise ValueError(f"its samples have different bits: {_listed(bits)}")
     if len(set(kinds)) > 1 or kinds[0] not in {UNSIGNED, FLOATING}:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -135,7 +136,7 @@ def read_zernike_table(
         given = {name: _number(path, number, name, text) for name, text in zip(names, row, strict=True)}
         fields.append(given["field_mm"] * 1e-3)
         waves.append(given.get("wavelength_nm", 530.0) * 1e-9)
-        table.append([given[f"Z{term}"] for term in terms])
+        table.append([given[name] for name in names if name.startswith("Z")])
     if min(fields) < 0 or not max(fields) <= 1:
         raise ValueError(
             f"field_mm of {path} must be from 0 to 1000, got {min(fields) * 1e3:g} to {max(fields) * 1e3:g}"
@@ -172,19 +173,18 @@ def read_zernike_table(
 
 def _terms(path: str | os.PathLike[str], names: list[str]) -> list[int]:
     if "field_mm" not in names or len(set(names)) < len(names):
-        raise ValueError(f"{path} must have a column field_mm, and each column once, got {', '.join(names)[:200]}")
+        shown = ", ".join(names)[:200]
+        raise ValueError(f"{path} must have columns between commas, field_mm among them and each once, got {shown}")
     terms = []
     for name in names:
         if name in ("field_mm", "wavelength_nm"):
             continue
-        digits = name.removeprefix("Z")
-        if not (
-            name.startswith("Z") and digits.isascii() and digits.isdecimal() and 1 <= int(digits[:4]) <= _MOST_TERMS
-        ):
+        term = re.fullmatch(r"Z0*([0-9]{1,2})", name)
+        if not (term and 1 <= int(term[1]) <= _MOST_TERMS) or int(term[1]) in terms:
             raise ValueError(
-                f"columns of {path} must be field_mm, wavelength_nm and Z1 to Z{_MOST_TERMS}, got {name!r:.60}"
+                f"columns of {path} must be field_mm, wavelength_nm and Z1 to Z{_MOST_TERMS} once, got {name!r:.60}"
             )
-        terms.append(int(digits))
+        terms.append(int(term[1]))
     if not terms:
         raise ValueError(f"{path} must have columns of coefficients such as Z4, got {', '.join(names)[:200]}")
     return terms

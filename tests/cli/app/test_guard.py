@@ -97,10 +97,7 @@ class TestGuard(BaseTester):
         assert asked(guard, UPLOAD, method, origin=origin) == 403
         assert asked(guard, origin=origin, kind="websocket") == "websocket.close"
 
-    @pytest.mark.parametrize(
-        "origin",
-        ["http://127.0.0.1:7860", "HTTP://LOCALHOST:7860", "https://lab.example", None],
-    )
+    @pytest.mark.parametrize("origin", ["http://127.0.0.1:7860", "HTTP://LOCALHOST:7860", "https://lab.example", None])
     def test_feature_the_page_itself_may_ask_by_each_of_its_names(self, origin, guard):
         assert asked(guard, UPLOAD, "POST", origin=origin) == 200
         assert asked(guard, origin=origin, kind="websocket") == "websocket.accept"

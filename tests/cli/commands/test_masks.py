@@ -40,12 +40,7 @@ class TestMasks(BaseTester):
     def test_feature_out_and_back(self, folder, capsys):
         assert run("export heights.npy -o slm --panel 90x60 --bits 10 --suffix .tif --rotate 90 --flip up-down") == 0
         told = capsys.readouterr().out
-        for words in (
-            "90 x 60 px, 8 a mask pixel",
-            "2 of 10 bits",
-            "read back, phase differs by up to 0.003",
-            "wrote",
-        ):
+        for words in ("90 x 60 px, 8 a mask pixel", "2 of 10 bits", "read back, phase differs by up to 0.003", "wrote"):
             assert words in told
         assert run("import slm -o back.npy") == 0
         assert np.abs(np.load("back.npy") - np.load("heights.npy")).max() <= 1060e-9 / 2**11 * 1.0001

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -48,13 +49,13 @@ class TestPsf(BaseTester):
 
     @pytest.mark.parametrize("suffix", [".npy", ".safetensors"])
     def test_feature_masks_of_a_file_are_those_drawn(self, suffix, tmp_path, capsys):
-        masks = PixelwiseMask(1, generator=torch.Generator().manual_seed(1))
+        masks, name = PixelwiseMask(1, generator=torch.Generator().manual_seed(1)), os.fsdecode(b"a$\\b$\xff")
         if suffix == ".npy":
-            np.save(tmp_path / "m.npy", masks.heights().detach().numpy())
+            np.save(tmp_path / f"{name}.npy", masks.heights().detach().numpy())
         else:
-            save_file(masks.state_dict(), tmp_path / "m.safetensors")
+            save_file(masks.state_dict(), tmp_path / f"{name}.safetensors")
         output = ["-o", str(tmp_path / "a.png"), "--depths", "1", "--window", "21"]
-        assert main(["psf", str(tmp_path / f"m{suffix}"), *output]) == 0
+        assert main(["psf", str(tmp_path / f"{name}{suffix}"), *output]) == 0
         optics = TiDyOptics(masks, fidelity=Fidelity(window=21, stray_light="discard"))
         psi = optics.camera.defocus(torch.tensor([1.0])).tolist()
         held = 100 * optics.psf_bank(defocus=psi).psfs.detach().sum((2, 3))[0]

@@ -53,10 +53,7 @@ class TestRawDevelop(BaseTester):
         options = "--demosaic half --white-balance 2 1 1.5 --highlights keep --no-preview"
         assert main(["raw", "develop", files[2], "-o", str(tmp_path), *options.split()]) == 0
         expected = develop(
-            RawCapture.open(files[2]),
-            "half",
-            white_balance=torch.tensor([2.0, 1.0, 1.5]),
-            highlights="keep",
+            RawCapture.open(files[2]), "half", white_balance=torch.tensor([2.0, 1.0, 1.5]), highlights="keep"
         )
         self.assert_close(read_image(tmp_path / "c.png"), expected.clamp(0, 1), atol=1 / 65535)
         assert not (tmp_path / "c.jpg").exists()

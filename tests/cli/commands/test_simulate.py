@@ -26,13 +26,7 @@ class TestSimulate(BaseTester):
         assert {p.name for p in scene.iterdir()} == {"image.png", "depth.pfm", "image_coded.png"}
         told = capsys.readouterr()
         assert told.err == ""
-        for word in (
-            "80 x 72 px",
-            "f/17.6",
-            "5 learnable masks",
-            "px holds red",
-            "no pixel",
-        ):
+        for word in ("80 x 72 px", "f/17.6", "5 learnable masks", "px holds red", "no pixel"):
             assert word in told.out
 
     def test_feature_five_lines_of_python_give_the_same(self, scene):

@@ -28,6 +28,7 @@ UNITS = {  # words beside "phase" in a header, and radians in one
     "/ 2pi": 2 * math.pi,
     "(units of 2 * π)": 2 * math.pi,
     "(λ)": 2 * math.pi,
+    "[wavelengths]": 2 * math.pi,
     "modulo 2π (rad)": 1.0,
 }
 SEPARATORS = (",", ", ", ";", " ; ", "\t", " ", "   ")
@@ -103,9 +104,10 @@ class TestReadResponse(BaseTester):
         assert read_response(tmp_path / "lut.csv", 8) == pytest.approx(PLAIN, abs=1e-4)
 
     def test_exception_a_unit_that_is_not_read(self, tmp_path):
-        (tmp_path / "lut.csv").write_text("Level (%), Phase shift (nm)\n0,0\n1,1.5\n2,3\n3,4.5")
-        with pytest.raises(ValueError, match="header gives phases in nm, and read are radians"):
-            read_response(tmp_path / "lut.csv", 2)
+        for unit, word in (("nm", "Phase shift"), ("π/2", "phase"), ("nm", "OPD"), ("grad", "Phase")):
+            (tmp_path / "lut.csv").write_text(f"Level (%), {word} ({unit})\n0,0\n1,1.5\n2,3\n3,4.5", encoding="utf-8")
+            with pytest.raises(ValueError, match=f"header gives phases in {unit}, and read are radians"):
+                read_response(tmp_path / "lut.csv", 2)
         (tmp_path / "lut.csv").write_text("Level (%), Phase shift (rad)\n0,0\n1,1.5\n2,3\n3,4.5")
         assert read_response(tmp_path / "lut.csv", 2) == [0, 1.5, 3, 4.5]
 

@@ -59,8 +59,7 @@ class TestAutoBalance(BaseTester):
         self.assert_close(auto_balance(raw)[[0, 1, 2]], torch.tensor([2.0, 1.0, 1.25]), rtol=2e-3, atol=0)
 
     @pytest.mark.parametrize(
-        ("level", "reason"),
-        [(60000, "is saturated everywhere, so its white"), (100, "a channel of the capture")],
+        ("level", "reason"), [(60000, "is saturated everywhere, so its white"), (100, "a channel of the capture")]
     )
     def test_exception_balance_cannot_be_estimated(self, level, reason):
         raw = grey_under({"R": 0.5, "G": 1.0, "B": 0.8})

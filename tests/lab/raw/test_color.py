@@ -10,10 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kornia_tidy.lab.raw.color import (
-    SRGB_FROM_XYZ,
-    camera_to_srgb,
-)
+from kornia_tidy.lab.raw.color import SRGB_FROM_XYZ, camera_to_srgb
 from tests.base import BaseTester
 
 with warnings.catch_warnings(), np.printoptions():  # importing colour sets NumPy's print options

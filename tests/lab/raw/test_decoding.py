@@ -102,11 +102,7 @@ class TestDecodeRaw(BaseTester):
         """A file of 24 megapixels needs 46 MiB, its counts as much, and Python, NumPy and LibRaw their own memory."""
         arguments = [sys.executable, "-I", "-S", "-c", PEAK, str(DECODER), json.dumps(sys.path), "60", str(2**31)]
         told = subprocess.run(
-            arguments,
-            input=DATA,
-            capture_output=True,
-            check=True,
-            env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            arguments, input=DATA, capture_output=True, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
         )
         limit = int(told.stderr.split()[-1]) * 1024 + 32 * 2**20
         assert decode_raw(DATA, 60, limit)[1].shape == (1, 36, 48)

@@ -139,14 +139,8 @@ class TestDemosaic(BaseTester):
             ((mosaic, *filter_tile("GMYC"), "libraw_ahd"), "of a four-colour array must be one of 'linear', 'vng'"),
             ((mosaic, *xtrans, "libraw_ahd"), "X-Trans array must be one of 'markesteijn', got 'ahd'"),
             ((mosaic / 0, *bayer, "libraw_ahd"), "mosaic must be finite, got inf"),
-            (
-                (mosaic, *quad, "libraw_ahd"),
-                "four-colour and X-Trans arrays, not RRGGRRGGGGBBGGBB: choose",
-            ),
-            (
-                (mosaic, *stripes, "libraw_markesteijn"),
-                "LibRaw demosaics Bayer, four-colour and X-Trans arr",
-            ),
+            ((mosaic, *quad, "libraw_ahd"), "four-colour and X-Trans arrays, not RRGGRRGGGGBBGGBB: choose"),
+            ((mosaic, *stripes, "libraw_markesteijn"), "LibRaw demosaics Bayer, four-colour and X-Trans arr"),
         ):
             with pytest.raises(ValueError, match=message):
                 demosaic(*args)

@@ -103,6 +103,7 @@ class TestDngSensor(BaseTester):
             ({259: (SHORT, [34712])}, "its picture is compressed by the unknown method 34712"),
             ({258: (SHORT, [32])}, "its samples are integers of 32 bits, and those of 1 to 16 can be decoded"),
             ({258: (SHORT, [64]), 339: (SHORT, [3])}, "floating-point numbers of 64 bits, and those of 16, 24 or 32"),
+            ({50975: (LONG, [2])}, r"its pixels are interleaved, which cannot be decoded \(RowInterleaveFactor 2"),
             ({339: (SHORT, [2])}, r"its SampleFormat is 2, not 1 \(unsigned\) or 3"),
             ({277: (SHORT, [2])}, "its picture behind a filter array has 2 samples a pixel, not 1"),
             ({257: (LONG, [10])}, "its picture has 48 x 10 pixels, and 22 to 64000 can be decoded"),

@@ -132,6 +132,5 @@ class TestInWholeNumbers(BaseTester):
     def test_gradcheck_of_the_matrix_after_methods_of_real_numbers(self):
         matrix = torch.tensor([[1.0, 0.5, 0], [0, 1, 0], [0.5, 0, 2]])
         self.gradcheck(
-            lambda mosaic: demosaic(mosaic, *filter_tile("GBRG"), "bilinear", matrix),
-            (torch.rand(2, 1, 4, 6),),
+            lambda mosaic: demosaic(mosaic, *filter_tile("GBRG"), "bilinear", matrix), (torch.rand(2, 1, 4, 6),)
         )

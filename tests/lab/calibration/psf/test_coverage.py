@@ -37,11 +37,7 @@ def lights():
     starts = {"coded": fisher_mask(), "flat": "flat"}
     return {
         (name, z): point_light(
-            PixelwiseMask(1, initial=start),
-            float(CAMERA.defocus(torch.tensor(z))),
-            SIDE,
-            Spectrum.monochrome(),
-            CAMERA,
+            PixelwiseMask(1, initial=start), float(CAMERA.defocus(torch.tensor(z))), SIDE, Spectrum.monochrome(), CAMERA
         )
         for name, start in starts.items()
         for z in DISTANCES
