@@ -821,18 +821,15 @@ static void add_over_field(const scene_parameters *s, workspace *d, tally *t, co
     spread_tile(&t->lines, plane, b->columns.tile, d->psf);
 }
 
-// Adds the gradient of a layer's light, which was found, to that of the plane: the transpose of find_light and convolve_one.
-// Neighbours in a row are added one round after the other, when what was stored is in memory.
-static void spread_light(const scene_parameters *s, workspace *d, tally *t, const block *b, int32_t layer, int64_t c,
-                         const vec *light) {
-    const int64_t side = s->side, rows = side + BAND - 1, height = rows + BAND - 1, pitch = window_pitch(s);
-    const REAL *psf = s->psfs + (layer * s->channels + c) * side * side;
+// Adds to rows of light the transpose of convolve_one, of a block's light. Neighbours in a row are added one round after the
+// other, when what was stored is in memory.
+static void spread_rays(const ray *rays, const REAL *psf, const vec *light, int64_t side, int64_t pitch, const tally *t) {
+    const int64_t rows = side + BAND - 1, height = rows + BAND - 1;
     for (int64_t j = 0; j < side; j++) memcpy(t->psf + j * height + BAND - 1, psf + j * side, side * sizeof(REAL));
-    memset(t->rows, 0, rows * pitch * sizeof(REAL));
     for (int64_t lane = 0; lane < LANES; lane++)
         for (int64_t r = 0; r < rows; r++) {
-            const int64_t from = d->rays[r].from, first = from + (lane + LANES - from % LANES) % LANES;
-            for (int64_t j = first; j < d->rays[r].to; j += LANES) {
+            const int64_t from = rays[r].from, first = from + (lane + LANES - from % LANES) % LANES;
+            for (int64_t j = first; j < rays[r].to; j += LANES) {
                 REAL *to = t->rows + r * pitch + j;
                 vec sum = *(const loose *)to;
 #pragma GCC unroll 8
@@ -840,6 +837,21 @@ static void spread_light(const scene_parameters *s, workspace *d, tally *t, cons
                 *(loose *)to = sum;
             }
         }
+}
+
+// Adds the gradient of a layer's light, which was found, to that of the plane.
+static void spread_light(const scene_parameters *s, workspace *d, tally *t, const block *b, int32_t layer, int64_t c,
+                         const vec *light) {
+    const int64_t side = s->side, rows = side + BAND - 1, pitch = window_pitch(s), plane = layer * s->channels + c;
+    memset(t->rows, 0, rows * pitch * sizeof(REAL));
+    if (s->over.node_rows) blend_line(&d->psfs, plane, b->columns.tile, d->psf);
+    for (int order = 0; order < ORDERS; order++) {
+        if (!has_order(&s->over, b->rows.tile, b->columns.tile, order)) continue;
+        const REAL *psf = s->over.node_rows ? (REAL *)(d->psf + order * d->psfs.vectors) : s->psfs + plane * side * side;
+        vec times[BAND];
+        for (int v = 0; v < BAND; v++) times[v] = factor(s, b, order, v) * light[v];
+        spread_rays(d->rays, psf, times, side, pitch, t);
+    }
     for (int64_t r = 0; r < rows; r++) {
         const REAL *lower = b->lower + r * s->map_row, *share = b->share ? b->share + r * s->map_row : 0;
         REAL *to = t->light + b->light + c * s->plane_channel + r * s->plane_row;
@@ -900,8 +912,8 @@ static void sum_threads(const scene_parameters *s, const tally *tallies, int64_t
     }
 }
 
-// Computes the gradients that are asked for from that of the light; over the field only those of PSFs. Each thread sums bands,
-// always the same ones, and threads are summed in their order. Returns 0 or NO_MEMORY.
+// Computes the gradients that are asked for from that of the light. Each thread sums bands, always the same ones, and threads
+// are summed in their order. Returns 0 or NO_MEMORY.
 int occlusion_gradients(const scene_parameters *s) {
     const int64_t all = s->layers * s->channels, area = s->side * s->side, numbers = nodes_of(s) * all * area;
     pool p = {0};
@@ -916,7 +928,7 @@ int occlusion_gradients(const scene_parameters *s) {
         for (int64_t n = bands * thread / threads; n < bands * (thread + 1) / threads; n++)
             go_back(s, spaces + thread, t, tables, n);
         for (int64_t n = 0; n < tables_of(s); n++) fold_table(s, t->tables + n * table_size(s), t->psfs + n * area);
-        for (int64_t n = 0; s->over.node_rows && n < numbers; n++)
+        for (int64_t n = 0; s->over.node_rows && s->psf_gradient && n < numbers; n++)
             t->psfs[n] = ((REAL *)t->nodes)[n / area * t->lines.vectors * LANES + n % area];
     }
     if (threads) {

@@ -105,14 +105,12 @@ def occlusion_direct_gradients(
 
     Raises:
         TypeError: as there.
-        ValueError: as there, or if the gradient does not fit, or more than that of the PSFs is wanted with ``places``.
+        ValueError: as there, or if the gradient does not fit.
         MemoryError: as there.
         NotBuiltError: as there.
     """
     light = _new_light(plane, psfs, layer_index, layer_weight, mean, stray_light, inside, places)
     check(dict(zip("BCHW", light.shape, strict=True)), light.dtype, gradient=(gradient, "B C H W"))
-    if places and (wanted[0] or wanted[2]):
-        raise ValueError("places must be empty where the gradient of the plane or of its mean is wanted")
     tensors = plane, psfs, mean, stray_light
     found = [x.new_empty(x.shape) if want and x is not None else None for x, want in zip(tensors, wanted, strict=True)]
     yield [x for x in found if x is not None]

@@ -8,8 +8,8 @@ is taken to first order about the cell's middle:
 
 Gather is linear in the PSFs, so that any backend renders a cell. In scatter the PSF is that of the pixel where light
 comes from, and its factors y and x stand before the sum. Occlusion divides, so the planes that it divides are blended
-and not the pictures: the PSF is that of the pixel that sees. Compiled occlusion has gradients of the PSFs; with
-those of light and defocus all are the gradients of cells, for the light that the compiled code renders.
+and not the pictures: the PSF is that of the pixel that sees. Compiled occlusion has gradients of light and PSFs; with
+that of defocus all are the gradients of cells, for the light that the compiled code renders.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def render_over_field(light: Tensor, defocus: Tensor, bank: FieldBank, field: Fi
     alike, tiled = field.nodes == (1, 1) and not occludes, None
     if alike or _is_compiled(light, defocus, bank, field, rendering):
         given = light, defocus, bank.defocus, bank.psfs[0] if alike else bank.psfs, None
-        whole = not (occludes and torch.is_grad_enabled() and any(map(wants_gradient, (light, defocus))))
+        whole = not (occludes and torch.is_grad_enabled() and wants_gradient(defocus))
         with torch.set_grad_enabled(whole and torch.is_grad_enabled()):
             tiled = render_layers(*given, rendering, field=None if alike else field)
         if whole:

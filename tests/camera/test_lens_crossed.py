@@ -61,8 +61,8 @@ def amplitude() -> Tensor:
 
 def camera(mask: nn.Module | None = None, **parts: object) -> TiDyOptics:
     parts = {"camera": LENS.camera(8e-6), "fidelity": SETTINGS, "spectrum": Spectrum.monochrome(), **parts}
-    settings = {"sensor": None, "color_space": "linear", "lens": LENS, "field_center": CENTER}
-    return TiDyOptics(masks() if mask is None else mask, **settings, **parts)
+    settings = {"sensor": None, "color_space": "linear", "lens": LENS, "field_center": CENTER, **parts}
+    return TiDyOptics(masks() if mask is None else mask, **settings)
 
 
 def scene(channels: int = 1, height: int = 36, width: int = 40) -> tuple[Tensor, Tensor]:
@@ -139,6 +139,31 @@ class TestEveryFeature(BaseTester):
 
 
 class TestGradients(BaseTester):
+    @pytest.mark.parametrize(("real", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-12)])
+    @pytest.mark.parametrize("border", ["reflect", "zero", "valid"])
+    @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.parametrize("lens", [None, LENS])
+    def test_feature_that_of_the_light_is_the_adjoint(self, lens, compositing, border, real, bound):
+        """<A u, v> = <u, A' v>: in parts of |A u| |v|, and of the product itself where all of v is above zero.
+
+        Of two images; with masks that learn, with kept PSFs, and in strips.
+        """
+        fidelity = SETTINGS.replace(double=real == torch.float64)
+        optics = camera(lens=lens, compositing=compositing, border=border, fidelity=fidelity).to(real)
+        images, depths = zip(*(scene(height=72, width=w) for w in (84, 92)), strict=True)
+        light, depth = (torch.cat([x[..., :84] for x in parts]).to(real) for parts in (images, depths))
+        light.requires_grad_()
+        for take in (at_once, at_once, in_strips):
+            seen = take(optics, light, depth)
+            for draw, seed in ((torch.rand, 9), (torch.randn, 10)):
+                other = draw(seen.shape, generator=seeded(seed), dtype=torch.float64).to(real)
+                (back,) = torch.autograd.grad(seen, light, other, retain_graph=True)
+                pairs = [(a.detach().double(), b.detach().double()) for a, b in ((seen, other), (light, back))]
+                one, two = (float((a * b).sum()) for a, b in pairs)
+                size = abs(one) if draw is torch.rand else float(pairs[0][0].norm() * pairs[0][1].norm())
+                assert abs(one - two) < bound * size
+            optics.requires_grad_(False)
+
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
     def test_gradcheck_along_directions(self, compositing):
         """To masks, dwell times and amplitude, against the difference of two captures, to 1e-3."""

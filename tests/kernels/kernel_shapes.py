@@ -290,15 +290,27 @@ def _occlude_gradient(drawn: tuple[tuple[Any, ...], LayeredScene, str, int]) -> 
 
 def occlude_light_gradient(draw: random.Random) -> Call:
     """``occlusion_gradients`` of occlusion.c, that of the light: products of PSFs, weights and what blocks pass on."""
-    arguments, scene, about, products = _occluding(draw)
-    psfs, gradient = arguments[1], torch.randn(*scene.image.shape[:2], *scene.output_size, dtype=arguments[1].dtype)
+    return _occlude_light_gradient(_occluding(draw))
+
+
+def field_occlude_light_gradient(draw: random.Random) -> Call:
+    """The same with PSFs that vary over the field."""
+    return _occlude_light_gradient(_occluding_over_field(draw))
+
+
+def _occlude_light_gradient(drawn: tuple[tuple[Any, ...], LayeredScene, str, int]) -> Call:
+    arguments, scene, about, products = drawn
+    gradient = torch.randn(*scene.image.shape[:2], *scene.output_size, dtype=arguments[1].dtype)
 
     def truth() -> tuple[Tensor, Tensor]:
-        planes = occlusion_planes(scene)
-        planes = planes._replace(light=planes.light.double().clone().requires_grad_(), psfs=psfs.double())
-        (expected,) = torch.autograd.grad((occlude_dense(*planes) * gradient).sum(), planes.light)
-        magnitude = _occlusion_magnitude(planes, gradient.abs(), planes.light)
-        return expected, 12 * _occlusion_error(psfs, psfs.shape[-1] ** 2 + 16) * magnitude
+        planes, shares = occlusion_planes(scene), None if scene.field is None else scene.places.of_pixels()
+        planes = planes._replace(light=planes.light.double().clone().requires_grad_(), psfs=planes.psfs.double())
+        (expected,) = torch.autograd.grad((occlude_dense(*planes, shares) * gradient).sum(), planes.light)
+        axis = planes.psfs if shares is None else 2 * planes.psfs.amax(0)
+        magnitude = _occlusion_magnitude(planes._replace(psfs=axis), gradient.abs(), planes.light)
+        error = _occlusion_error(axis.to(gradient), axis.shape[-1] ** 2 + 16)
+        of_truth = 1e-15 * expected.abs().max()  # by transforms, whose round-off is that of the largest numbers
+        return expected, 12 * _terms(scene) * error * magnitude + of_truth
 
     given = *arguments, gradient, [True, False, False, False]
     return Call(about, "occlusion_direct_gradients", given, 3 * products, truth)
@@ -729,6 +741,7 @@ KERNELS: dict[str, Callable[[random.Random], Call]] = {
     "occlusion.c: gradient of the light": occlude_light_gradient,
     "occlusion.c: light over the field": field_occlude,
     "occlusion.c: gradient over the field": field_occlude_gradient,
+    "occlusion.c: gradient of the light over the field": field_occlude_light_gradient,
     "mutual_intensity.c: energies": energies,
     "mutual_intensity.c: gradient": field_gradient,
     "scattered.c: light": scattered,

@@ -17,6 +17,12 @@ from kornia_tidy.kernels.occlusion_ops import (
 from tests.kernels import kernel_shapes
 from tests.kernels.operator_tester import LayeredSceneTester, SceneOperatorTester, needs_compiler
 
+OTHERS = (
+    kernel_shapes.occlude_light_gradient,
+    kernel_shapes.field_occlude_gradient,
+    kernel_shapes.field_occlude_light_gradient,
+)
+
 
 def scene(**changes: Any) -> dict[str, Any]:
     """Arguments of ``occlusion_direct``: 2 images, 2 channels, 3 layers, 3x3 PSFs."""
@@ -116,6 +122,7 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
         given = [arguments[n] for n in (0, 1, 4, 5) if arguments[n] is not None]
         assert [(x.shape, x.dtype, x.is_meta) for x in found] == [(x.shape, x.dtype, True) for x in given]
 
+    @needs_compiler
     def test_dynamo_is_one_node_of_a_whole_graph(self):
         call = kernel_shapes.occlude_gradient(random.Random(1))
         compiled = torch.compile(call.operator, fullgraph=True, backend="aot_eager")
@@ -131,16 +138,14 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
 
     @needs_compiler
     @pytest.mark.parametrize("seed", range(12))
-    def test_feature_of_the_light_within_round_off(self, seed):
+    @pytest.mark.parametrize("draw", OTHERS)
+    def test_feature_of_light_and_over_the_field_within_round_off(self, draw, seed):
         torch.manual_seed(seed)
-        call = kernel_shapes.occlude_light_gradient(random.Random(seed))
+        call = draw(random.Random(seed))
         assert call.error() <= 1, call.about
 
     @needs_compiler
-    @pytest.mark.parametrize(
-        "draw",
-        [kernel_shapes.occlude_gradient, kernel_shapes.occlude_light_gradient, kernel_shapes.field_occlude_gradient],
-    )
+    @pytest.mark.parametrize("draw", [kernel_shapes.occlude_gradient, *OTHERS])
     @pytest.mark.parametrize("threads", [1, 3, 50])
     def test_feature_the_same_every_time_with_as_many_threads(self, threads, draw):
         before, call = torch.get_num_threads(), draw(random.Random(3))
@@ -151,13 +156,6 @@ class TestOcclusionDirectGradients(SceneOperatorTester):
             torch.set_num_threads(before)
         assert torch.equal(first, second)
         assert (first - call.operator(*call.arguments)[0]).norm() <= 1e-5 * first.norm()
-
-    @needs_compiler
-    @pytest.mark.parametrize("seed", range(12))
-    def test_feature_over_the_field_within_round_off(self, seed):
-        torch.manual_seed(seed)
-        call = kernel_shapes.field_occlude_gradient(random.Random(seed))
-        assert call.error() <= 1, call.about
 
     def test_exception(self):
         with pytest.raises(ValueError, match=r"gradient must have shape \(2, 2, 9, 32\), got \(3,\)"):

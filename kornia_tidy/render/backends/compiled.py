@@ -161,12 +161,12 @@ class _Sums:
 
 
 def _occlusion_gradients(scene: LayeredScene, gradient: Tensor) -> GradientPairs:
-    """Return the gradients directly; with those of depth, or over the field of light, all by transforms."""
+    """Return the gradients directly; with those of depth all by transforms."""
     planes = _occlusion(scene)
-    light, psfs, _, weight, mean, stray_light, _, places = planes
+    light, psfs, _, weight, mean, stray_light, *_ = planes
     tensors = light, psfs, mean, stray_light
     wanted = [wants_gradient(x) for x in tensors]
-    if wants_gradient(weight) or (places and wanted[0]):
+    if wants_gradient(weight):
         return (BatchedBackend() if scene.field is None else DenseBackend()).gradients(scene, gradient)
     with torch.no_grad():
         found = occlusion_direct_gradients(*planes, gradient, wanted)
