@@ -217,8 +217,6 @@ typedef struct {
     int64_t down, across, tiles;                    // tiles of an image
     const int64_t *row_edges, *column_edges;        // (down + 1,), (across + 1,): where tiles begin, and the end
     int64_t groups, bands, waves;                   // LANES columns of waves, LANES rows, waves in a row
-    int shared;                                     // whether tiles see the same PSFs as others
-    int64_t bundles, *bundle_rows, *bundle_edges;   // rows of tiles that see the same PSFs: first of each, where it begins
     transform in_rows, in_columns;
     REAL scale;                                     // of a transform there and back
     wave *turns;                                    // (groups,): exp(i pi j / columns)
@@ -236,29 +234,19 @@ typedef struct {
     vec *flat;          // of a tile's PSF, (ORDERS, vectors), and the same in columns of LANES numbers
     vec *samples;
     wave *moments;      // (2, bands, waves): spectra of light times x and times y
-    wave *psf;          // (ORDERS, bands, waves); of each layer, if tiles share PSFs
-    int64_t *made;      // (layers,): the tile that a layer's were made for, or -1
+    wave *psf;          // (ORDERS, bands, waves)
 } desk;
 
-// A tile: its image, its row and column there, its first pixel, how much of it lies in the image, the number of the first tile
-// that sees its PSFs, and their orders.
+// A tile: its image, its row and column there, its first pixel, how much of it lies in the image, and the orders of its PSF.
 typedef struct {
-    int64_t image, number, row, column, top, left, height, width, first;
+    int64_t image, number, row, column, top, left, height, width;
     int has[ORDERS];
 } tile;
 
-// The first of the neighbours along an axis with the same middle, which see the same PSFs.
-INLINE int64_t first_alike(const REAL *middles, int64_t n) {
-    while (middles && n && middles[n] == middles[n - 1]) n--;
-    return n;
-}
-
 INLINE tile tile_at(const work *w, int64_t image, int64_t number) {
-    const field *f = &w->s->over;
     const int64_t r = number / w->across, c = number % w->across, *row = w->row_edges + r, *column = w->column_edges + c;
-    const int64_t first = first_alike(f->row_middles, r) * w->across + first_alike(f->column_middles, c);
-    tile t = {image, number, r, c, row[0], column[0], row[1] - row[0], column[1] - column[0], first, {1}};
-    for (int order = ALONG_X; f->node_rows && order < ORDERS; order++) t.has[order] = has_order(f, r, c, order);
+    tile t = {image, number, r, c, row[0], column[0], row[1] - row[0], column[1] - column[0], {1}};
+    for (int order = ALONG_X; w->s->over.node_rows && order < ORDERS; order++) t.has[order] = has_order(&w->s->over, r, c, order);
     return t;
 }
 
@@ -490,9 +478,6 @@ static const wave *tile_psfs(const work *w, tile t, int64_t channel, int64_t lay
     if (!s->over.node_rows) return w->psfs + w->place[layer] * all;
     const int along_x = t.has[ALONG_X], along_y = t.has[ALONG_Y];
     const REAL radius = s->side / 2;
-    wave *spectra = d->psf + (w->shared ? layer * ORDERS * all : 0);
-    if (w->shared && d->made[layer] == t.first) return spectra;
-    d->made[layer] = t.first;
     blend_nodes(&d->lines, layer, nodes_of(s, layer, channel), next_node(s), w->scale);
     blend_line(&d->lines, layer, t.column, d->flat);
     for (int64_t g = 0, n = 0; g < groups; g++) {
@@ -509,8 +494,8 @@ static const wave *tile_psfs(const work *w, tile t, int64_t channel, int64_t lay
     }
     for (int order = 0; order < ORDERS; order++)
         if (t.has[order])
-            analyse_times(w, d->samples + order * count, s->side, s->side, groups, VALUE, 0, d->half, spectra + order * all);
-    return spectra;
+            analyse_times(w, d->samples + order * count, s->side, s->side, groups, VALUE, 0, d->half, d->psf + order * all);
+    return d->psf;
 }
 
 // Makes the spectra of a plane of light, and of the light times x and times y.
@@ -711,32 +696,27 @@ static int64_t apart(const int64_t *edges, int64_t count, int64_t side) {
     return tiles;
 }
 
-// Gathers or scatters all tiles of a channel; over the field a thread takes the rows of tiles with the same PSFs. Tiles whose
-// windows overlap are not scattered at the same time, so that the order of additions is always the same.
+// Gathers or scatters all tiles of a channel; over the field a thread takes a row of tiles. Tiles whose windows overlap are
+// not scattered at the same time, so that the order of additions is always the same.
 static void render_tiles(const work *w, int64_t channel, desk *desks, int kind) {
     const tiles *s = w->s;
     const int over_field = s->over.node_rows > 0;
-    const int64_t down = kind == SCATTER ? apart(w->bundle_edges, w->bundles, s->side) : 1;
+    const int64_t down = kind == SCATTER ? apart(w->row_edges, w->down, s->side) : 1;
     const int64_t across = kind == SCATTER && !over_field ? apart(w->column_edges, w->across, s->side) : 1;
-    for (int64_t n = 0; n < s->threads; n++) {
-        desks[n].lines.row = -1;
-        memset(desks[n].made, -1, s->layers * sizeof(int64_t));
-    }
-    for (int64_t phase = 0; phase < least(down, w->bundles) * across; phase++) {
+    for (int64_t n = 0; n < s->threads; n++) desks[n].lines.row = -1;
+    for (int64_t phase = 0; phase < least(down, w->down) * across; phase++) {
         const int64_t y = phase / across, x = phase % across;
-        const int64_t own = (w->bundles - y + down - 1) / down, beside = (w->across - x + across - 1) / across;
+        const int64_t own = (w->down - y + down - 1) / down, beside = (w->across - x + across - 1) / across;
         const int64_t together = over_field ? beside : 1;
 #pragma omp parallel for schedule(dynamic) num_threads(s->threads)
         for (int64_t n = 0; n < s->images * own * beside / together; n++) {
             desk *d = desks + thread_number();
             for (int64_t m = n * together; m < (n + 1) * together; m++) {
-                const int64_t *rows = w->bundle_rows + m / beside / s->images * down + y, column = m % beside * across + x;
-                if (over_field) begin_row(&d->lines, rows[0]);
-                for (int64_t row = rows[0]; row < rows[1]; row++) {
-                    const tile t = tile_at(w, m / beside % s->images, row * w->across + column);
-                    if (kind == SCATTER) scatter_tile(w, channel, t, d);
-                    else gather_tile(w, channel, t, d);
-                }
+                const int64_t row = m / beside / s->images * down + y, column = m % beside * across + x;
+                const tile t = tile_at(w, m / beside % s->images, row * w->across + column);
+                if (over_field) begin_row(&d->lines, row);
+                if (kind == SCATTER) scatter_tile(w, channel, t, d);
+                else gather_tile(w, channel, t, d);
             }
         }
     }
@@ -809,8 +789,7 @@ static desk take_desk(pool *p, const work *w) {
     d.half = take(p, orders * w->groups * s->rows, sizeof(wave));
     d.flat = take(p, over_field * ORDERS * d.lines.vectors + psf, sizeof(vec));  // the last row is read beyond its end
     d.samples = take(p, ORDERS * psf * s->side, sizeof(vec));
-    d.moments = take(p, over_field * 2 * waves, sizeof(wave)), d.made = take(p, s->layers, sizeof(int64_t));
-    d.psf = take(p, over_field * (w->shared ? s->layers : 1) * ORDERS * waves, sizeof(wave));
+    d.moments = take(p, over_field * 2 * waves, sizeof(wave)), d.psf = take(p, over_field * ORDERS * waves, sizeof(wave));
     return d;
 }
 
@@ -838,12 +817,6 @@ static int compute(const tiles *s, int kind) {
     w.turns = take(&p, w.groups, sizeof(wave)), w.place = take(&p, s->layers, sizeof(int64_t));
     w.needed = take_zeros(&p, s->images * w.tiles * s->layers, w.groups);
     REAL *numbers = take(&p, 4 * (s->rows + w.waves), sizeof(REAL));
-    w.bundle_rows = take(&p, w.down + 1, sizeof(int64_t)), w.bundle_edges = take(&p, w.down + 1, sizeof(int64_t));
-    for (int64_t n = 0; n < w.down && !p.missing; n++)
-        if (first_alike(f->row_middles, n) == n) w.bundle_edges[w.bundles] = w.row_edges[n], w.bundle_rows[w.bundles++] = n;
-    if (!p.missing) w.bundle_rows[w.bundles] = w.down, w.bundle_edges[w.bundles] = w.row_edges[w.down];
-    w.shared = w.bundles < w.down;
-    for (int64_t n = 0; n < w.across; n++) w.shared |= first_alike(f->column_middles, n) < n;
     for (int64_t n = 0; n < s->threads; n++) desks[n] = take_desk(&p, &w);
     int status = p.missing ? NO_MEMORY : note_layers(&w) ? 0 : REFUSED;
     if (!status) {

@@ -27,7 +27,6 @@ from kornia_tidy.kernels.scene_checks import new_pixels, new_plane, new_psfs, re
 from kornia_tidy.kernels.window_sides import is_window_size, needed_side, size_step
 
 SOURCE = KERNELS / "overlap.c"
-CELL = 2  # tiles along an axis that may share PSFs, whose spectra are then made once
 
 
 @cache

@@ -16,8 +16,6 @@ class Places(NamedTuple):
 
     .. math:: h(y, x) = \sum_{ij} \left( a_i b_j + (y - y_0) \, a'_i b_j + (x - x_0) \, a_i b'_j \right) h_{ij}
 
-    Neighbours with equal middles see the same PSFs.
-
     Args:
         row_edges: first row of each row of tiles and the end of the last, (R + 1,) int64 on a processor.
         row_middles: :math:`y_0` of each row of tiles, (R,) float64.

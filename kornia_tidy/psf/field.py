@@ -84,14 +84,11 @@ class Field:
         inside = (places.abs() <= 1).double()[:, None] / max(half, 0.5)
         return weights, slopes * inside, bends * inside**2
 
-    def tiles(
-        self, axis: int, first: int, pixels: int, most: int, beyond: int = 0, together: int = 1
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def tiles(self, axis: int, first: int, pixels: int, most: int, beyond: int = 0) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return the tiles along an axis of a part of the picture: as large as possible, and alike in any part.
 
-        Neighbours within a cell share its PSFs: the middle is that of them all. A cell of n pixels takes for its middle
-        :math:`h + h'' (n^2 - 1) / 24`, so that its first order is right on average. Slopes are zero in cells in which
-        PSFs may be taken as in the middle.
+        A tile of n pixels takes for its middle :math:`h + h'' (n^2 - 1) / 24`, so that its first order is right on
+        average. Slopes are zero in tiles in which PSFs may be taken as in the middle.
 
         Args:
             axis: 0 for rows, 1 for columns.
@@ -99,30 +96,24 @@ class Field:
             pixels: of the part.
             most: pixels of a tile.
             beyond: pixels of a border on either side of the picture, which tiles also cover.
-            together: tiles of a cell at most.
 
         Returns:
-            Where in the part tiles begin, and its end, (n + 1,) int64; the middles of their cells, counted from
+            Where in the part tiles begin, and its end, (n + 1,) int64; the middles of the picture's tiles, counted from
             the part's first pixel, (n,) float64; the nodes' weights of the first order there, (n, 2, nodes).
 
         Example:
             >>> edges, middles, weights = Field((1, 90), (1, 2)).tiles(1, 20, 60, 40)
             >>> edges.tolist(), middles.tolist(), weights[:, 0, 1].round(decimals=2).tolist()
             ([0, 10, 40, 60], [-5.5, 24.5, 54.5], [0.16, 0.5, 0.84])
-            >>> Field((1, 90), (1, 2)).tiles(1, 20, 60, 30, together=2)[1]
-            tensor([ 9.5000,  9.5000, 54.5000], dtype=torch.float64)
         """
         whole = self.size[axis] + 2 * beyond
         side = -(-whole // -(-whole // most))
-        many = max(1, min(together, (self.still if side <= self.still else self.cell) // side))
         begin, end = ((at + beyond) // side for at in (first, first + pixels - 1))
-        tiles = torch.arange(begin, end + 1)
-        edges = torch.cat([(tiles * side - beyond - first).clamp(min=0), torch.tensor([pixels])])
-        starts = tiles // many * many
-        sides = side * (-(-whole // side) - starts).clamp(max=many).double()[:, None]
-        middles = starts * side - beyond + (sides[:, 0] - 1) / 2
+        starts = torch.arange(begin, end + 1) * side - beyond
+        middles = starts.double() + (side - 1) / 2
+        edges = torch.cat([(starts - first).clamp(min=0), torch.tensor([pixels])])
         weights, slopes, bends = self.along(axis, middles)
-        orders = weights + bends * (sides**2 - 1) / 24, slopes * (sides > self.still)
+        orders = weights + bends * (side**2 - 1) / 24, slopes * (side > self.still)
         return edges, middles - first, torch.stack(orders, 1)
 
 

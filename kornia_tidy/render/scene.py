@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.kernels.occlusion_ops import TILE
-from kornia_tidy.kernels.overlap_ops import CELL, window_size
+from kornia_tidy.kernels.overlap_ops import window_size
 from kornia_tidy.kernels.places import Places
 from kornia_tidy.mode import Mode, torch_mode
 from kornia_tidy.psf.field import Field
@@ -117,8 +117,7 @@ class LayeredScene:
     def places(self) -> Places:
         """Tiles over the field and the nodes' weights there: at the pixels that see, for scatter at those of the light.
 
-        Tiles are as large as suits the PSFs, but not larger than the field's cells, in which those of gather and
-        scatter share PSFs. Those of occlusion are small.
+        Tiles are as large as suits the PSFs, but not larger than the field's cells. Those of occlusion are small.
         """
         assert self.field is not None
         side, origin, occludes = self.psfs.shape[-1], self.field.origin, self.compositing == "occlusion"
@@ -126,8 +125,7 @@ class LayeredScene:
         sides, beyond = (self.padded_size, side // 2) if scatters else (self.output_size, 0)
         moved = side // 2 * (valid - scatters)
         most = TILE if occludes else (min(self.field.cell, window_size(side) - side + 1),) * 2
-        many = 1 if occludes else CELL
-        rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond, many) for i in (0, 1))
+        rows, columns = (self.field.tiles(i, origin[i] + moved, sides[i], most[i], beyond) for i in (0, 1))
         return Places(*rows, *columns)
 
     @cached_property

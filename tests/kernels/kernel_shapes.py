@@ -807,8 +807,7 @@ def _over_field(draw: random.Random) -> tuple[_Scene, int, bool]:
         middles = torch.tensor(edges[1:], dtype=torch.float64) - 2 * torch.rand(len(edges) - 1, dtype=torch.float64)
         weights = torch.randn(len(edges) - 1, 2, nodes[axis], dtype=torch.float64)
         weights[:, 1] *= draw.choice((0, 0.02, 0.02))
-        one = torch.arange(len(middles)) // (run := draw.choice((1, 2, 3))) * run  # neighbours with the same PSFs
-        parts += [torch.tensor(edges), middles[one], weights[one]]
+        parts += [torch.tensor(edges), middles, weights]
     psfs = torch.randn(*nodes, *scene.psfs.shape, dtype=scene.psfs.dtype)
     places = Places(*parts)
     about = f"{scene.about} nodes {nodes} tiles {len(parts[1])}x{len(parts[4])}"
@@ -846,7 +845,7 @@ def _overlap_error(scene: _Scene, light: Tensor, size: int) -> float:
         torch.einsum("i,j,ijdcyx->dcyx", rows[m], columns[n], scene.psfs.double().abs())
         for m, n in ((0, 0), (1, 0), (0, 1))
     )
-    return 2 * _transform_error(light, value + 4 * size * (y + x), size)
+    return 2 * _transform_error(light, value + 2 * size * (y + x), size)
 
 
 def _pixels(draw: random.Random, scene: _Scene) -> Tensor:

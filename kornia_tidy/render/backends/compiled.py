@@ -117,12 +117,8 @@ class CompiledBackend:
         transforms, planes, sums = blocks + pairs + layers, layers + _WINDOW_PLANES * threads, 0
         if scene.field is not None:  # light in each tile, PSFs in each pair, and x and y times both
             down, across = scene.field.nodes
-            middles = scene.places.row_middles, scene.places.column_middles
-            tall, wide = (-(-len(x) // len(x.unique())) for x in middles)  # tiles that share PSFs
-            cell, kept_psfs = (tall * tile[0], wide * tile[1]), terms * layers * (tall * wide > 1)
-            psfs = int(present_in_tiles(labels.every(SAMPLE), cell, scene.psfs.shape[-4], step=SAMPLE).sum())
-            transforms, planes = terms * (blocks + psfs) + pairs, (_WINDOW_PLANES + _OF_FIELD + kept_psfs) * threads
-            sums = terms * 2 * side**2 * across * (psfs + 2 * down * layers * -(-rows // tall))
+            transforms, planes = terms * blocks + (terms + 1) * pairs, (_WINDOW_PLANES + _OF_FIELD) * threads
+            sums = terms * 2 * side**2 * across * (pairs + 2 * down * layers * rows)
             kept += 2 * across * layers * side**2 * itemsize * threads
             pairs *= terms
         operations = transform_operations(*sides) * transforms + _WINDOW * blocks + sums
