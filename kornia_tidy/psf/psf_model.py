@@ -551,7 +551,7 @@ class PSFModel:
             states, weights = shown.moment(self.moment)
         else:
             states, weights = shown.states, shown.durations if shown.mixture is None else shown.weights
-            if self.lens is None and self._amplitudes_differ:
+            if self.lens is None and self.aperture is not None and self._amplitudes_differ:
                 weights = weights * self.relative_light(dtype)
         if self.state is not None:
             states, weights = states[self.state : self.state + 1], torch.ones_like(weights[:1])
@@ -830,7 +830,7 @@ class PSFModel:
     @property
     def _amplitudes_differ(self) -> bool:
         """Whether each mask has its own amplitude."""
-        return self.aperture is not None and (own := self._amplitude) is not None and own.ndim == 3
+        return (own := self._amplitude) is not None and own.ndim == 3
 
     def _band(self) -> float:
         return defocus_band(self.pupil.max_rho2, min(self.spectrum.wavelengths), REFERENCE_WAVELENGTH)
