@@ -10,9 +10,7 @@ import pytest
 import torch
 from scipy import stats
 
-from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from tests.base import BaseTester
-from tests.benchmarks.fit_temperature import temperature_by_moments
 from tests.benchmarks.results import __main__ as command
 from tests.benchmarks.results.measure import NO_CAMERA, search
 from tests.benchmarks.results.scenes import BenchScene, SceneSet
@@ -172,15 +170,3 @@ class TestCommand(BaseTester):
     def test_exception_one_sentence(self, arguments, match, tmp_path):
         with pytest.raises(SystemExit, match=match):
             command.main([str(tmp_path), *arguments])
-
-
-class TestDepthUncertainty(BaseTester):
-    def test_feature_variances_of_a_fitted_temperature_are_as_large_as_squared_errors(self):
-        generator = torch.Generator().manual_seed(0)
-        logits = 9 * torch.randn(2, 9, 20, 20, generator=generator)
-        depth = torch.rand(2, 1, 20, 20, generator=generator)
-        mask = torch.rand(2, 1, 20, 20, generator=generator) < 0.7
-        found = temperature_by_moments(logits, depth, mask)
-        mean, deviation = depth_moments(logits.double() / found)
-        errors = (mean - depth).square()[mask].mean()
-        assert float(deviation.square()[mask].mean()) == pytest.approx(float(errors), rel=1e-6)
