@@ -83,7 +83,7 @@ class AnyCameraHead(ClosedFormHead):
         network.last.bias = nn.Parameter(torch.tensor([SHARE, 0.0, 0.0, 0.0]))
         network.range_checked = True  # no check of the range, as maps leave [0, 1]
         self.network: NAFNet = network
-        self.stride = network.stride
+        self.stride, self.seamless = network.stride, network.seamless
 
     def forward(self, image: Tensor, noise: Tensor | float | None = None) -> Tensor:
         """Return the image, (B, 3, H, W)."""

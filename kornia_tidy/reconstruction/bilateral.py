@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from kornia_tidy.checks import check_float_tensor
+from kornia_tidy.reconstruction.strips import strip_rows
 from kornia_tidy.render.borders import pad_border
 
 
@@ -20,12 +23,13 @@ def bilateral_filter(image: Tensor, color: Tensor | float, window: int = 7, spac
 
     Args:
         image: y, (B, C, H, W).
-        color: c, the width in colour, in units of the image: a number, or (B, 1, H, W) or what broadcasts to it.
+        color: c, the width in colour, in units of the image: a number, or (B, 1, H, W) or what broadcasts with it, such
+            as (K, B, 1, 1, 1) for K widths at once.
         window: side of the neighbourhood in pixels, odd.
         space: s, the width in space, in pixels.
 
     Returns:
-        (B, C, H, W) in the dtype of the image.
+        (B, C, H, W), or (K, B, C, H, W), in the dtype of the image.
 
     Raises:
         TypeError: if the image is not floating point.
@@ -46,12 +50,27 @@ def bilateral_filter(image: Tensor, color: Tensor | float, window: int = 7, spac
         raise ValueError(f"window must be odd and positive, got {window}")
     radius, (height, width) = window // 2, image.shape[-2:]
     padded = pad_border(image, radius, "reflect" if radius < min(height, width) else "replicate")
-    total, weighted, scale = torch.zeros_like(image[:, :1]), torch.zeros_like(image), -0.5 / color**2
-    for down in range(window):
-        for across in range(window):
+    scale = torch.as_tensor(-0.5 / color**2).to(image)
+    scale = scale.expand(torch.broadcast_shapes(scale.shape, image[:, :1].shape))
+    rows = strip_rows(image)
+    strips = [
+        _filtered(padded[..., top : top + rows + 2 * radius, :], scale[..., top : top + rows, :], radius, space)
+        for top in range(0, height, rows)
+    ]
+    return torch.cat(strips, -2)
+
+
+def _filtered(padded: Tensor, scale: Tensor, radius: int, space: float) -> Tensor:
+    """Filter an image that is padded by a radius; the scale is that of squared differences of colour."""
+    height, width = scale.shape[-2:]
+    image = padded[..., radius : radius + height, radius : radius + width]
+    total, weighted = torch.zeros_like(image[:, :1]), torch.zeros_like(image)
+    for down in range(2 * radius + 1):
+        for across in range(2 * radius + 1):
             other = padded[..., down : down + height, across : across + width]
             apart = (other - image).abs().sum(1, keepdim=True)
-            distance = ((down - radius) ** 2 + (across - radius) ** 2) / space**2
-            weight = (apart.square() * scale - 0.5 * distance).exp()
-            total, weighted = total + weight, torch.addcmul(weighted, weight, other)
+            weight = (apart.square() * scale).exp()
+            near = math.exp(-0.5 * ((down - radius) ** 2 + (across - radius) ** 2) / space**2)
+            total = torch.add(total, weight, alpha=near)
+            weighted = torch.addcmul(weighted, weight, other, value=near)
     return weighted / total

@@ -6,11 +6,11 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
 from torch import Tensor, nn
 
 from kornia_tidy.checks import check_choice, check_count, check_float_tensor, check_not_negative
 from kornia_tidy.choices import INVERSES
+from kornia_tidy.kernels.pixel_ops import decode, encode
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.reconstruction.bilateral import bilateral_filter
 from kornia_tidy.reconstruction.depth_likelihood import depth_likelihood, likelihood_filters
@@ -314,11 +314,11 @@ class ClosedForm(nn.Module):
             deconvolved = convolve_kernels(light, self.filters.to(light.dtype))
             shares = (fits / (BLEND_SHARPNESS * 10 ** _above(noise))).softmax(1)
             image = self._encode((shares.unsqueeze(2) * deconvolved).sum(1))
-            by_depth = [self._brightness(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
+            by_depth = [self._encode(deconvolved.mean(2)), 1 - (fits / SHARPNESS).clamp(min=LEAST) / LEAST]
         else:
             image = self._encode(self._chosen(light, estimates, place))
             if self.layers:
-                by_depth = [self._brightness(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
+                by_depth = [self._encode(convolve_kernels(brightness, self.filters.to(light.dtype))[:, :, 0])]
         image = self._smooth(image, color)
         maps = [capture, self._encode(estimates).flatten(1, 2), image, (level + 2).mean(1, keepdim=True), *by_depth]
         return Restoration(image, torch.cat(maps, 1), deconvolved)
@@ -341,17 +341,13 @@ class ClosedForm(nn.Module):
         """Return the width of the bilateral filter in colour."""
         return COLOR * 10 ** (COLOR_EXPONENT * _above(noise))
 
-    def _brightness(self, light: Tensor) -> Tensor:
-        """Encode one map for each depth, (B, D, H, W)."""
-        return self._encode(light.unsqueeze(2).expand(-1, -1, 3, -1, -1))[:, :, 0]
-
     def _noise_of(self, light: Tensor) -> Tensor:
         """Return the standard deviation of the sensor's noise at light within [0, 1]."""
         dark, rise = self.noise_model.to(light.dtype)
         return (dark + rise * light).sqrt()
 
     def _light(self, colors: Tensor) -> Tensor:
-        return rgb_to_linear_rgb(colors) if self.encoded else colors
+        return decode(colors) if self.encoded else colors
 
     def _without_stray_light(self, light: Tensor) -> Tensor:
         return light - self._stray_light(light) if self.has_stray_light else light
@@ -365,7 +361,7 @@ class ClosedForm(nn.Module):
 
     def _encode(self, light: Tensor) -> Tensor:
         light = light.clamp(0, 1)
-        return linear_rgb_to_rgb(light) if self.encoded else light
+        return encode(light) if self.encoded else light
 
 
 def _above(noise: Tensor) -> Tensor:

@@ -78,6 +78,7 @@ class ClosedFormHead(ReconstructionHead):
         )
         self.network = network
         self.stride = 1 if network is None else network.stride
+        self.seamless = network is not None and network.seamless
         if network is not None:
             wanted = closed_form_channels(layers, likelihood=likelihood, fine=fine)
             if network.in_channels != wanted:

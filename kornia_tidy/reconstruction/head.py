@@ -41,6 +41,7 @@ class ReconstructionHead(nn.Module, ABC):
 
     stride: int
     whole_image = False  # True if each output depends on the whole image, which then cannot be tiled
+    seamless = False  # True if tests show that tiles equal the whole; other networks are measured, for seconds
     range_checked = False
 
     def __init__(self, in_channels: int, out_channels: int) -> None:

@@ -82,7 +82,7 @@ class JointClosedFormHead(ClosedFormHead):
     ) -> None:
         check_count("the number of classes of network", network.out_channels - 3, 2)
         super().__init__(network, layers, encoded=encoded, likelihood=True, inverse=inverse)
-        self.stride = math.lcm(network.stride, REDUCTION)
+        self.stride, self.seamless = math.lcm(network.stride, REDUCTION), False  # its tiles are measured
         if refiner is not None:
             wanted = closed_form_channels(layers), 3
             if (refiner.in_channels, refiner.out_channels) != wanted:

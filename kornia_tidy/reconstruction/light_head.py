@@ -14,14 +14,11 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.reconstruction.any_camera import AnyCameraHead
 from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm
-from kornia_tidy.reconstruction.closed_form_head import ClosedFormHead
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
-from kornia_tidy.reconstruction.nafnet import NAFNet
 from kornia_tidy.reconstruction.receptive_field import receptive_field
 from kornia_tidy.reconstruction.restored_over_field import restored_over_field
 from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm
@@ -176,9 +173,7 @@ def reconstruct_light(
     with whole_picture(head, colours):
         cut = None
         if one_tile(head, colours, memory_budget) is None:
-            network = head.head.network if type(head.head) is ClosedFormHead else head.head
-            known = type(network) in {AnyCameraHead, NAFNet}  # by tests; others are measured for seconds
-            if not known:
+            if not (known := getattr(head.head, "seamless", False)):
                 check_seamless(head)  # which does not know of stray light
             cut = overlap if overlap is not None and (known or overlap < receptive_field(head)) else None
         maps: Any = reconstruct_tiled(head, colours, overlap=cut, memory_budget=memory_budget, progress=progress)

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from kornia_tidy.checks import check_count
 from kornia_tidy.reconstruction.head import ReconstructionHead
+from kornia_tidy.reconstruction.strips import strip_rows
 
 ENCODER = (1, 1, 1, 1)  # blocks of each level
 MIDDLE = 2
@@ -58,6 +59,7 @@ class NAFNet(ReconstructionHead):
     """
 
     stride = 2 ** len(ENCODER)
+    seamless = True
 
     def __init__(self, in_channels: int = 3, out_channels: int = 3, width: int = 16, repeats: int = 1) -> None:
         super().__init__(in_channels, out_channels)
@@ -78,11 +80,12 @@ class NAFNet(ReconstructionHead):
         features = self.first(image)
         skips = []
         for blocks, down in zip(self.encoder, self.down, strict=True):
-            skips.append(blocks(features))
+            skips.append(_after(blocks, features))
             features = down(skips[-1])
         features = self.middle(features)
         for blocks, up in zip(reversed(self.decoder), reversed(self.up), strict=True):
-            features = blocks(functional.pixel_shuffle(up(features), 2) + skips.pop())  # whose memory is freed
+            features = functional.pixel_shuffle(up(features), 2).add_(skips.pop())  # whose memory is freed
+            features = _after(blocks, features)
         return self.last(features)
 
     def reset_parameters(self) -> None:
@@ -114,6 +117,21 @@ def deepened(weights: Mapping[str, Tensor], head: nn.Module) -> dict[str, Tensor
             block = {f"{name}.{key}": value.clone() for key, value in module.state_dict().items()}
             found |= {k: torch.zeros_like(v) if k.endswith((".beta", ".gamma")) else v for k, v in block.items()}
     return found
+
+
+def _after(blocks: nn.Module, features: Tensor) -> Tensor:
+    """Return features after blocks without attention; in strips of rows these take their place."""
+    height, rows = features.shape[-2], strip_rows(features)
+    if rows == height:
+        return blocks(features)
+    for block in blocks.children():
+        kept = features[:, :, :0]
+        for top in range(0, height, rows):
+            strip = block(features[:, :, max(0, top - 1) : top + rows + 1])  # with a row of neighbours on each side
+            features[:, :, top - kept.shape[2] : top] = kept  # only now, as this strip needs the last of its rows
+            kept = strip[:, :, min(top, 1) :][:, :, :rows]
+        features[:, :, height - kept.shape[2] :] = kept
+    return features
 
 
 def _blocks(channels: int, count: int, *, attention: bool = False) -> nn.Sequential:

@@ -283,12 +283,10 @@ class RuledClosedForm(ClosedForm):
         steps = deviation.new_tensor(COLORS)
         usual = (USUAL * deviation[:, None] / steps).log().abs().argmin(1)
         choices = [(usual + step).clamp(0, len(COLORS) - 1) for step in range(-AROUND, AROUND + 1)]
-        risks = [2 * deviation.square()]
-        for choice in choices:
-            color = steps[choice][:, None, None, None]
-            risks.append(torch.stack([_risk(*pair, color) for pair in pairs]).mean(0))
-        colors = torch.stack([torch.zeros_like(deviation), *(steps[choice] for choice in choices)], 1)
-        return colors.gather(1, torch.stack(risks, 1).argmin(1, keepdim=True))[:, :, None, None]
+        colors = steps[torch.stack(choices)]
+        risks = torch.stack([_risk(*pair, colors[..., None, None, None]) for pair in pairs]).mean(0)
+        best = torch.cat([2 * deviation.square()[None], risks]).argmin(0, keepdim=True)
+        return torch.cat([torch.zeros_like(colors[:1]), colors]).gather(0, best)[0, :, None, None, None]
 
     def _perturbed(self, light: Tensor, noise: Tensor, kernels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the picture that the kernels restore, the same with a little more noise, and that noise restored."""
@@ -380,10 +378,10 @@ def band_facts(psfs: Tensor) -> Tensor:
 
 
 def _risk(first: Tensor, second: Tensor, noise: Tensor, color: Tensor) -> Tensor:
-    """Return Stein's estimate of the risk of a bilateral filter, but for a constant, (B,)."""
+    """Return Stein's estimate of the risk of bilateral filters (K, B, 1, 1, 1), but for a constant, (K, B)."""
     taken, other = (bilateral_filter(image, color, WINDOW, SPACE) for image in (first, second))
     kept = noise * (other - taken) / PERTURBED
-    return ((taken - first).square() + 2 * kept).mean((1, 2, 3))
+    return ((taken - first).square() + 2 * kept).mean((-3, -2, -1))
 
 
 def _parabolas(halves: Tensor) -> Tensor:

@@ -131,7 +131,7 @@ class TestReconstructLight(BaseTester):
         light = torch.rand(3, 30, 200, generator=torch.Generator().manual_seed(0)) * torch.linspace(0, 1, 200)
         seen = []
         light_head = LightHead(TrainedSystem(optics, head, settings, 0))
-        found = reconstruct_light(light_head, light, memory_budget=2 << 20, progress=lambda *n: seen.append(n))
+        found = reconstruct_light(light_head, light, memory_budget=1 << 20, progress=lambda *n: seen.append(n))
         told = MeasuredNoise(*head.closed_form.noise_model.tolist())
         light = check_capture(light, told).light  # without outliers
         whole = head(optics.encode(light[None]))[0]
