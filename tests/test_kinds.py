@@ -70,12 +70,19 @@ class TestEveryOperation(BaseTester):
         given = argument(operation, 1, torch.float64)
         self.gradcheck(bound(operation, given), (given,))
 
+
+class TestEveryCompiledOperation(BaseTester):
+    @pytest.mark.parametrize(
+        "operation",
+        [
+            pytest.param(one, id=name, marks=pytest.mark.slow if one.slow_to_compile else pytest.mark.takes_seconds)
+            for name, one in OPERATIONS.items()
+        ],
+    )
     @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
     @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
     @pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")  # by the compiler itself
-    def test_dynamo(self, operation, request):
-        if operation.slow_to_compile and not request.config.getoption("--runslow"):
-            pytest.skip("slow: run with --runslow")
+    def test_dynamo(self, operation):
         given = argument(operation)
         call = bound(operation, given)
         self.assert_close(torch.compile(call, backend="eager")(given), call(given))

@@ -24,7 +24,6 @@ from tests.test_kinds import argument, bound
 # Sums of 1e4 products in float32 at most, and gradients of theirs; see tests/test_accelerators.py.
 ROUNDING, OF_GRADIENTS = 1e-5, 1e-4
 EPSILON = {"occlusion": 1e-2}  # in float32 its divisors have a larger one: see tests/test_accelerators.py
-precisions = pytest.mark.parametrize("float64", [True, False], ids=["float64", "no_float64"])
 
 
 def learnt(call: Callable[[Tensor], Any], given: Tensor) -> list[Tensor]:
@@ -68,46 +67,47 @@ class OnDevice(BaseTester):
         self,
         call: Callable[[Tensor], Any],
         given: Tensor,
-        float64: bool,
-        least: float = 0,
+        epsilon: float = 0,
         rounded: Tensor | None = None,
     ) -> None:
-        """Compare within the least tolerance, or twice what a picture that is rounded otherwise changes."""
+        """Compare on devices with float64 and without, where an operation may have a larger epsilon.
+
+        The tolerance is the rounding's, or twice what a picture that is rounded otherwise changes.
+        """
         expected = learnt(call, given.clone().requires_grad_())
         others = expected if rounded is None else learnt(call, rounded.requires_grad_())
-        with SimulatedDevice(float64=float64) as device:
-            found = learnt(moved(call, device), device.put(given.clone().requires_grad_()))
-        assert len(found) == len(expected)
-        for number, (one, other) in enumerate(zip(found, expected, strict=True)):
-            assert one.device.type == DEVICE.type
-            rounding = OF_GRADIENTS if number == len(expected) - 1 else ROUNDING
-            atol = max(rounding, least) * max(1e-30, float(other.detach().abs().max()))
-            atol = max(atol, 2 * float((others[number] - other).detach().abs().max()))
-            self.assert_close(one.on_cpu.detach(), other.detach(), rtol=0, atol=atol)
+        for float64, least in ((True, 0), (False, epsilon)):
+            with SimulatedDevice(float64=float64) as device:
+                found = learnt(moved(call, device), device.put(given.clone().requires_grad_()))
+            assert len(found) == len(expected)
+            for number, (one, other) in enumerate(zip(found, expected, strict=True)):
+                assert one.device.type == DEVICE.type
+                rounding = OF_GRADIENTS if number == len(expected) - 1 else ROUNDING
+                atol = max(rounding, least) * max(1e-30, float(other.detach().abs().max()))
+                atol = max(atol, 2 * float((others[number] - other).detach().abs().max()))
+                self.assert_close(one.on_cpu.detach(), other.detach(), rtol=0, atol=atol)
 
 
-@precisions
 class TestOperations(OnDevice):
     @pytest.mark.parametrize("name", OPERATIONS)
-    def test_feature_agrees_with_the_cpu(self, name, float64):
+    def test_feature_agrees_with_the_cpu(self, name):
         given = argument(OPERATIONS[name])
-        least = 0 if float64 else EPSILON.get(name, 0)
-        self.assert_agrees(bound(OPERATIONS[name], given), given, float64, least)
+        self.assert_agrees(bound(OPERATIONS[name], given), given, EPSILON.get(name, 0))
 
 
-@precisions
+@pytest.mark.takes_seconds
 class TestHeadsAndLosses(OnDevice):
     @pytest.mark.parametrize("name", HEADS)
-    def test_feature_agrees_with_the_cpu(self, name, float64):
+    def test_feature_agrees_with_the_cpu(self, name):
         generator = torch.Generator().manual_seed(0)
         call = HEADS[name]()
         given = torch.rand(2, 3, 16, 16, generator=generator)
         signs = torch.randint(0, 2, given.shape, generator=generator) * 2 - 1
         rounded = given * (1 + torch.finfo(given.dtype).eps * signs)
-        self.assert_agrees(call, given, float64, rounded=rounded)
+        self.assert_agrees(call, given, rounded=rounded)
 
 
-@precisions
+@pytest.mark.parametrize("float64", [True, False], ids=["float64", "no_float64"])
 class TestDataSets(BaseTester):
     """Data sets hold their items on the CPU; a camera on an accelerator takes their pictures there."""
 

@@ -1,4 +1,4 @@
-"""The rows of docs/record/extremes.md: the quick ones in every run, the others with --runslow."""
+"""The rows of docs/record/extremes.md."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "record" / "extremes.md"
 
 
 class TestExtremes:
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(
         "row", [pytest.param(row, id=row.name, marks=[pytest.mark.slow] if row.slow else []) for row in ROWS]
     )
