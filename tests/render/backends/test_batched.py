@@ -135,7 +135,11 @@ class TestTiles(BaseTester):
                     assert tile + size - 1 <= 1.25 * (2 * size + 64)
 
 
-@pytest.fixture(params=["whole planes", "parts of them", "one block", "tiles"])
+SCENES = (("reflect", "linear", 1), ("zero", "nearest", 3), ("valid", "linear", 3))  # border, layers, maps
+PARTS = ("whole planes", "parts of them", "tiles", "one block")  # two by turns for each scene and compositing
+
+
+@pytest.fixture
 def parts(request, monkeypatch) -> str:
     if request.param in ("one block", "tiles"):
         monkeypatch.setattr(batched, "MOST_SAMPLES", 0)
@@ -148,10 +152,14 @@ class TestOnAnAccelerator(BaseTester):
     """There all layers are convolved, of whole planes or of tiles, and no value is looked at."""
 
     @pytest.mark.parametrize(
-        ("border", "layers", "maps"),
-        [("reflect", "linear", 1), ("zero", "nearest", 3), ("valid", "linear", 3)],
+        ("compositing", "border", "layers", "maps", "parts"),
+        [
+            (compositing, *scene, parts)
+            for number, (compositing, scene) in enumerate(product(COMPOSITING, SCENES))
+            for parts in PARTS[number % 2 :: 2]
+        ],
+        indirect=["parts"],
     )
-    @over_compositing
     def test_gradcheck_equals_dense_without_a_wait(self, compositing, border, layers, maps, parts):
         bank = make_bank(light=0.9, veil=True)
         image, defocus = make_scene(bank, batch=3)
