@@ -19,6 +19,7 @@ class TestMoved:
         assert found is importlib.import_module(new)
         assert found.__spec__.name == new
 
+    @pytest.mark.takes_seconds
     def test_feature_a_module_inside_is_imported_once(self):
         """Whether the old name comes first or the new one."""
         orders = ("systems.units", "optics.units"), ("lab.raw.color", "raw.color")

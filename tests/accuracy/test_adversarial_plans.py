@@ -66,6 +66,7 @@ class TestAdversarialScenes(BaseTester):
         assert (outcome.case.kind, outcome.case.compositing) == ("checkerboard", "occlusion")
         assert outcome.measured <= min(outcome.predicted, outcome.case.tolerance), outcome
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize(("background", "own"), [(15.5, -20.0), (20.5, 0.0), (-19.5, -30.0)])
     @pytest.mark.parametrize("border", ["reflect", "zero"])
     def test_feature_light_through_a_gap_has_the_blur_of_the_gap(self, monkeypatch, border, background, own):

@@ -174,6 +174,7 @@ class TestRandomDepthBlur(BaseTester):
             with pytest.raises(ValueError, match=f"{name} must be positive"):
                 RandomDepthBlur(**{name: -1.0})
 
+    @pytest.mark.takes_seconds
     @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
     def test_dynamo(self):
         image, depth = scene(2)

@@ -155,6 +155,7 @@ class TestCheckCapture(BaseTester):
         assert check_capture(light, told(sensor)).least_noise == 0
         assert blockiness(compressed[:, 3:, 5:]) > JPEG > blockiness(light)  # wherever the blocks begin
 
+    @pytest.mark.takes_seconds
     def test_feature_jpeg_counts_as_noise_unless_more_is_told(self):
         optics = TiDyOptics(fidelity="draft", sensor=SensorNoise(2.4 / 20_000, full_well=20_000.0))
         system = any_camera_system(optics)

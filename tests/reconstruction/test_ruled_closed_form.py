@@ -67,6 +67,7 @@ def circular(image, kernel):
 
 
 class TestRuledClosedForm(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_the_error_without_noise_is_that_of_simulated_pictures(self):
         """Periodic pictures of the spectrum, blurred and restored by the definition; 400 of them."""
         psfs = bank(NODES).psfs

@@ -192,6 +192,7 @@ class TestRawReconstruct(BaseTester):
         assert "kept" in capsys.readouterr().out
         assert contents(folder) == contents(folder.with_name("whole"))
 
+    @pytest.mark.takes_seconds
     @pytest.mark.parametrize("change", ["checkpoint", "file", "option", "missing", "record", "none"])
     def test_feature_resume_keeps_only_what_is_still_right(self, batch, change, capsys):
         files, weights, folder = batch
