@@ -38,6 +38,7 @@ _ENCODINGS = {
     codecs.BOM_UTF16_BE: "utf-16",
 }
 _HIDDEN = ("__macosx", "@eadir", "thumbs.db", "ehthumbs.db", "desktop.ini")  # besides names that begin with a dot
+_POINTER = b"version https://git-lfs.github.com/spec/"
 _LEFTOVER = re.compile(r"\.[0-9a-f]{32}\.tmp")  # temporary names of files and folders until they are complete
 
 
@@ -46,7 +47,7 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
     Raises:
         FileNotFoundError: if the file is missing.
-        ValueError: if it is not a regular file, is empty, or is larger than the memory.
+        ValueError: if it is not a regular file, is empty, a pointer of Git LFS, or is larger than the memory.
     """
     path = check_file(path)
     try:
@@ -57,6 +58,8 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise type(error)(f"cannot read {path}: {error.strerror or error}") from None
     if not data:
         raise ValueError(f"cannot read {path}: the file is empty")
+    if data.startswith(_POINTER):
+        raise ValueError(f"cannot read {path}: it is a pointer of Git LFS to the file, which git lfs pull fetches")
     return data
 
 
@@ -69,19 +72,23 @@ def check_file(path: str | os.PathLike[str]) -> Path:
             this name.
     """
     path = Path(path)
-    try:
-        folder = path.is_dir()
-    except OSError as error:
-        if error.errno != errno.ENAMETOOLONG:
-            raise
-        raise ValueError(f"cannot read {str(path)[:100]}...: the name is too long") from None
-    if folder:
+    if _is_folder(path, "read"):
         raise ValueError(f"cannot read {path}: it is a folder")
     if not path.exists():
         raise FileNotFoundError(f"cannot read {path}: there is no such file")
     if not path.is_file():
         raise ValueError(f"cannot read {path}: it is not a regular file")
     return path
+
+
+def _is_folder(path: Path, verb: str) -> bool:
+    """Return whether a path is a folder; refuse names that are too long for the system."""
+    try:
+        return path.is_dir()
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise ValueError(f"cannot {verb} {str(path)[:100]}...: the name is too long") from None
 
 
 def check_folder(path: str | os.PathLike[str]) -> Path:
@@ -318,11 +325,12 @@ def check_writable(path: Path) -> None:
 
     Raises:
         FileNotFoundError: if the folder does not exist.
-        ValueError: if the path is a folder; or a device or a pipe, which a renamed file would replace, even /dev/null.
+        ValueError: if the path is a folder; or a device or a pipe, which a renamed file would replace, even /dev/null;
+            or if its name is too long.
     """
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
-    if path.is_dir():
+    if _is_folder(path, "write"):
         raise ValueError(f"cannot write {path}: it is a folder")
     if path.exists() and not path.is_file():
         raise ValueError(f"cannot write {path}: it is not a regular file")
@@ -413,10 +421,11 @@ def _named(path: Path) -> Generator[None]:
     """Put the path of the final file into errors about the temporary file, such as "no space left on device"."""
     try:
         yield
-    except (FileExistsError, FileNotFoundError):  # distinguishes processes that write into one folder
+    except FileExistsError:  # distinguishes processes that write into one folder
         raise
     except OSError as error:
-        raise OSError(f"cannot write {path}: {error.strerror or error}") from error
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else OSError
+        raise kind(f"cannot write {path}: {error.strerror or error}") from error
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:

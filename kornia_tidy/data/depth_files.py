@@ -26,8 +26,8 @@ from kornia_tidy.optics.holes import fill_holes
 from kornia_tidy.optics.units import warn_once
 
 # Largest numbers of data types, which often mark unknown depth.
-UNKNOWN: dict[Any, float] = {np.dtype(kind): int(np.iinfo(kind).max) for kind in ("u2", "i2", "u4", "i4")}
-UNKNOWN |= {np.dtype(kind): float(np.finfo(kind).max) for kind in ("f2", "f4")}
+UNKNOWN: dict[Any, float] = {np.dtype(kind): int(np.iinfo(kind).max) for kind in ("u2", "i2", "u4", "i4", "u8", "i8")}
+UNKNOWN |= {np.dtype(kind): float(np.finfo(kind).max) for kind in ("f2", "f4", "f8")}
 BASELINES = (1e-3, 10.0)  # m; a pair farther apart or nearer is rather given in another unit
 NEAR_DISPARITY = 5.0  # a larger median is taken for disparity in pixels, a smaller one for metres
 

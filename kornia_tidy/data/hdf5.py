@@ -69,7 +69,7 @@ def stored_numbers(file: Any, name: str) -> Any:
     if link is not None and not isinstance(link, h5py.HardLink):
         raise ValueError(f"{name:.80} in its HDF5 is a link")
     dataset = file[name] if link is not None else None
-    if not isinstance(dataset, h5py.Dataset):
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None:  # of an empty one
         return None
     if dataset.external or dataset.is_virtual:
         raise ValueError(f"the values of {name:.80} in its HDF5 lie in other files")

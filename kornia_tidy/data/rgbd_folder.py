@@ -7,6 +7,7 @@ import os
 import re
 from pathlib import Path, PurePath
 from typing import Any
+from unicodedata import normalize
 
 from kornia_tidy.data.calibration_files import read_calibration
 from kornia_tidy.data.depth_files import check_depth_options
@@ -211,9 +212,13 @@ def _check_within(pattern: str) -> None:
 
 
 def _matches(root: Path, pattern: str) -> dict[tuple[str, ...], str]:
-    """Return the files that match a pattern: path relative to the root by the parts that ``*`` matches."""
-    parts = pattern.split("*")
+    """Return the files that match a pattern: path relative to the root by the parts that ``*`` matches.
+
+    The parts are composed (NFC): macOS may write the two names of a pair in different forms of Unicode.
+    """
+    parts = PurePath(pattern).as_posix().split("*")
     fits = re.compile("([^/]+)".join(map(re.escape, parts)))
     pattern = "*".join(map(glob.escape, parts))
     found = (file.relative_to(root).as_posix() for file in find_files(root, pattern))
-    return {match.groups(): match.string for match in map(fits.fullmatch, found) if match}
+    matches = (match for match in map(fits.fullmatch, found) if match)
+    return {tuple(normalize("NFC", part) for part in match.groups()): match.string for match in matches}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -21,12 +22,13 @@ from kornia_tidy.data.npz import MAGIC as NPZ
 from kornia_tidy.data.npz import decode_npz
 from kornia_tidy.data.orientation import orientation_of
 from kornia_tidy.data.pfm import decode_pfm
-from kornia_tidy.data.picture_header import PNG, check_header, png_chunks
+from kornia_tidy.data.picture_header import JPEG, PNG, check_header, png_chunks
 from kornia_tidy.data.quiet import caught
 from kornia_tidy.data.tiff import decode_tiff
 from kornia_tidy.data.tiff_directories import MAGIC as TIFF
 from kornia_tidy.data.transfer import is_linear
 from kornia_tidy.files import error_prefix, read_bytes
+from kornia_tidy.optics.units import warn_once
 
 # Beginnings of messages about incomplete pictures; surplus bytes at the end, as some cameras write, are harmless.
 _DAMAGE = ("libpng error", "Premature end", "Corrupt JPEG data", "Inconsistent progression", "Invalid SOS")
@@ -87,6 +89,15 @@ def decode_stored(data: bytes, path: str | os.PathLike[str], *, depth: bool = Fa
             stored = _decode(data, depth)
     except MemoryError:
         raise ValueError(f"cannot read {path}: the memory that it needs is not there") from None
+    if depth and data.startswith(JPEG):
+        path = Path(path)
+        warn_once(
+            None,
+            ("JPEG", path.parent),
+            f"{path} is a JPEG, whose compression changes numbers: depths are off by some units, and holes stored as 0 "
+            f"are read as near depths: keep depth in PNG or PFM",
+            stacklevel=4,
+        )
     values = stored.values[..., None] if stored.values.ndim == 2 else stored.values
     if values.ndim == 3 and values.shape[0] in {1, 3, 4} and values.shape[2] > 4:
         raise ValueError(
@@ -126,8 +137,17 @@ def _decode(data: bytes, depth: bool) -> Stored:
     if data.startswith(TIFF):
         return Stored(*decode_tiff(data, depth))
     decoded = _decode_with_opencv(data)
+    if depth and data.startswith(b"BM") and not _is_grey_bmp(data):
+        raise ValueError("its pixels are the colours of a palette (BMP), which are no depth")
     stored = _as_in_png(decoded, data, depth) if data.startswith(PNG) else Stored(_colours(decoded))
     return stored._replace(orientation=orientation_of(data), linear=not depth and is_linear(data))
+
+
+def _is_grey_bmp(data: bytes) -> bool:
+    """Return whether a BMP has colours without a palette, or one of 256 greys, each of its own number."""
+    old = data[14] == 12  # OS/2
+    first, step, bits = 14 + data[14], 3 if old else 4, data[24 if old else 28]
+    return bits >= 24 or all(data[(at := first + step * k) : at + 3] == bytes([k] * 3) for k in range(256))
 
 
 def _as_in_png(decoded: NDArray[Any], data: bytes, depth: bool) -> Stored:

@@ -192,8 +192,13 @@ class TestPictureKinds(BaseTester):
         (tmp_path / "a.png").write_bytes(png(values, bits, 3, palette, *alpha))
         found = read_image(tmp_path / "a.png").permute(1, 2, 0)
         np.testing.assert_allclose(found * 255, PALETTE[values[..., 0]], atol=1e-4)
-        with pytest.raises(ValueError, match="the colours of a palette"):
-            read_depth(tmp_path / "a.png")
+        (tmp_path / "b.png").write_bytes(bmp(8, 0, bytes(range(8)), GREY[::-1]))
+        for name in ("a.png", "b.png"):
+            with pytest.raises(ValueError, match="the colours of a palette"):
+                read_depth(tmp_path / name)
+        (tmp_path / "a.jpg").write_bytes(jpeg("L"))
+        with pytest.warns(UserWarning, match="is a JPEG, whose compression changes numbers"):
+            read_depth(tmp_path / "a.jpg", 0.01)
 
     @pytest.mark.parametrize(("bits", "kind"), [(8, 2), (16, 2), (8, 6), (16, 6)])
     def test_feature_colours_keep_their_numbers_and_alpha_is_dropped(self, bits, kind, tmp_path):

@@ -41,6 +41,10 @@ class TestRGBDFolder(BaseTester):
             self.assert_close(sample["image"][:, 0, 0], torch.tensor([0.2, 0.2, 1.0]))
             assert torch.equal(sample["depth"], torch.full((1, 4, 6), index + 1.0))
 
+    def test_feature_names_in_two_forms_of_unicode_are_a_pair(self, tmp_path):
+        write(tmp_path, "\u00e9.png", "e\u0301_depth.png", 1000)
+        assert RGBDFolder(tmp_path, "./*.png", "./*_depth.png", scale=0.001).names == ["\u00e9"]
+
     def test_feature_names_are_sorted_as_text(self, tmp_path):
         for number in (2, 10, 1):
             write(tmp_path, f"s{number}.png", f"s{number}_depth.png", 1000)

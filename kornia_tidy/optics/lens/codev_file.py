@@ -15,8 +15,8 @@ _FICTITIOUS = re.compile(r"\d{3,6}\.\d{3,6}")  # digits of nd - 1, and of Abbe's
 # Commands about the use, drawing, making or improvement of a lens, not its shape.
 _DISPLACED = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE", "CUF")  # allowed where they are 0
 _WITHOUT_EFFECT = (
-    *("ASP", "CAN", "CCY", "CLS", "CON", "CWL", "DER", "EPD", "FNO", "GO", "INI", "LEN", "LOC", "NA", "NAO"),
-    *("PIM", "PRE", "SLB", "SPH", "TEM", "THC", "VLX", "VLY", "VUX", "VUY", "WTF", "WTW", "KC"),
+    *("ASP", "CAN", "CCY", "CLS", "CON", "CWL", "DER", "DOR", "EPD", "FNO", "GLC", "GO", "INI", "LEN", "LOC"),
+    *("NA", "NAO", "PIM", "PRE", "SLB", "SPH", "TEM", "THC", "UID", "VLX", "VLY", "VUX", "VUY", "WTF", "WTW", "KC"),
     *(f"{letter}C" for letter in _POWERS),
 )
 

@@ -99,7 +99,8 @@ def codev(prescription: dict[str, Any], unit: str = "M", *, radii: bool = True) 
     size = {"M": 1.0, "C": 0.1, "I": 1 / 25.4}[unit]
     lines = [
         f"RDM{'' if radii else ' N'};LEN   \"VERSION: 11.2\"", f"TITLE '{prescription['name']}'", "EPD 5.0",
-        f"DIM {unit}", "WL 656.2725 587.5618 486.1327", "REF 2", "YAN 0.0 3.0 6.0", "SO 0.0 0.1e14 ! a star",
+        f"DIM {unit}", "WL 656.2725 587.5618 486.1327", "REF 2", "YAN 0.0 3.0 6.0", "DOR 1.15 1.05",
+        "SO 0.0 0.1e14 ! a star",
     ]  # fmt: skip
     rows = prescription["surfaces"]
     for i, row in enumerate(rows):
@@ -113,7 +114,7 @@ def codev(prescription: dict[str, Any], unit: str = "M", *, radii: bool = True) 
             code = f"{digits}.{round(index['vd'] * 1e4)}"
         else:
             code = "" if glass == "air" else f"{glass.replace('-', '')}" + ("" if glass == "PMMA" else "_SCHOTT")
-        lines += [f"S {shape!r} {gap * size!r} {code}", "  CCY 0; THC 0"]
+        lines += [f"S {shape!r} {gap * size!r} {code}", "  CCY 0; THC 0; GLC 0"]
         lines += ["  STO"] * (row.get("kind") == "stop")
         lines += [f"  CIR {row['r'] * size!r}"] if row.get("r") else []
         if row.get("poly") or row.get("k"):
