@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
+from kornia_tidy.files import output_folder
+
 
 class Row(NamedTuple):
     """A line of the summary."""
@@ -82,12 +84,14 @@ def output_paths(files: Sequence[str], folder: Path, suffixes: Sequence[str]) ->
         suffixes: replacements of a file's suffix, one for each output.
 
     Raises:
-        ValueError: if two files would become the same picture, or a picture would replace one of the files.
+        ValueError: if the folder is a file, two files would become the same picture, or a picture would replace one of
+            the files.
 
     Example:
         >>> output_paths(["shots/a.dng", "shots/../shots/a.dng"], Path("sharp"), [".png", ".json"])
         {'shots/a.dng': [PosixPath('sharp/a.png'), PosixPath('sharp/a.json')]}
     """
+    output_folder(folder)
     outputs: dict[str, list[Path]] = {}
     owners: dict[str, str] = {}
     first = {Path(path).resolve(): path for path in reversed(files)}

@@ -11,7 +11,7 @@ from kornia_tidy.choices import MASK_FAMILIES
 from kornia_tidy.cli.commands.shared import Folder, OwnScene
 from kornia_tidy.design.settings import DesignSettings
 from kornia_tidy.files import output_folder
-from kornia_tidy.settings import FNumber, Pixels, Seed, Unit, one_of
+from kornia_tidy.settings import FNumber, Seed, Unit, one_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -58,7 +58,7 @@ class Demo:
     masks: Annotated[int, Unit("K", "", 1, 64)] | None = None
     family: Annotated[str, one_of(MASK_FAMILIES)] | None = None
     f_number: FNumber | None = None
-    size: Pixels = 512
+    size: Annotated[int, Unit("PX", "pixels", 32)] = 512
     seed: Seed = 5  # of a scene of many kinds of texture
     scene: OwnScene = field(default_factory=OwnScene)
 

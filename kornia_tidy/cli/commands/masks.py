@@ -247,7 +247,7 @@ def _saved(path: str, name: str | None) -> SavedMasks:
         assert material is not None
         return SavedMasks(read_heights(path), material)
     state = camera_state(path)
-    with error_prefix(f"cannot read {path}"):
+    with error_prefix(f"cannot read {path}", TypeError):
         return masks_in_state(state, _material(name))
 
 

@@ -211,6 +211,8 @@ def _shown(value: Any, unit: Unit) -> str:
 
 def _value(setting: Setting, word: str) -> Any:
     """Return the value of an option from a word."""
+    if setting.name == "output" and not word:
+        raise argparse.ArgumentTypeError("must be a name, got an empty one")
     if isinstance(setting.unit, Parsed):
         try:
             return setting.unit.read(word)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from kornia_tidy.cli.commands.parser import Optional
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
-from kornia_tidy.cli.commands.shared import File, check_outputs, picture_beside
+from kornia_tidy.cli.commands.shared import File, check_once, check_outputs, picture_beside
 from kornia_tidy.settings import Unit
 
 
@@ -61,6 +61,7 @@ class CalibrateNoise:
         plot = picture_beside(self.plot, self.output)
         if plot is not None:
             check_choice("the suffix of a plot", plot.suffix.lower(), (".png", ".pdf", ".svg"))
+        check_once([*self.files, *self.dark])
         check_outputs([output, plot], [*self.files, *self.dark])
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.figures.style import save_figure

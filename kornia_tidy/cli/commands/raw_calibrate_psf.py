@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from kornia_tidy.cli.commands.parser import Given
 from kornia_tidy.cli.commands.raw_options import Dump, RawFiles
-from kornia_tidy.cli.commands.shared import File, SensorInElectrons, Window, check_outputs, picture_beside
+from kornia_tidy.cli.commands.shared import File, SensorInElectrons, Window, check_once, check_outputs, picture_beside
 from kornia_tidy.reconstruction.settings import LensSettings
 from kornia_tidy.settings import Count, Metres, Seconds, Unit
 
@@ -154,6 +154,7 @@ class CalibratePsf:
             if path is not None:
                 check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
         inputs = [*self.files, *self.reference]
+        check_once([*self.files, *self.reference])
         check_outputs([self.output, picture, self.fit_mask], inputs)
         if len(set(self.distances)) != len(self.distances) or not min(self.distances) > 0:
             raise ValueError(f"--distances must be different metres above zero, got {self.distances}")

@@ -247,6 +247,8 @@ def masks_of(masks: int | str, seed: int = 0) -> PixelwiseMask:
     from kornia_tidy.masks.pixelwise import PixelwiseMask
 
     if isinstance(masks, str):
+        if not Path(masks).exists():
+            raise FileNotFoundError(f"--masks is a number or a file (.npy, .safetensors): there is no file {masks:.80}")
         return PixelwiseMask(initial=read_heights(masks))
     return PixelwiseMask(masks, generator=torch.Generator().manual_seed(seed))
 
@@ -336,6 +338,15 @@ def picture_beside(picture: str | None, output: str) -> Path | None:
             raise
         return None
     return Path(picture or Path(output).with_suffix(".png"))
+
+
+def check_once(files: Iterable[str]) -> None:
+    """Raise ``ValueError`` for a capture that is given twice, under whichever path: it would count as two."""
+    found: set[Path] = set()
+    for file in files:
+        if (place := Path(file).resolve()) in found:
+            raise ValueError(f"{file} is given twice, and each capture counts once")
+        found.add(place)
 
 
 def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None]) -> None:

@@ -141,12 +141,16 @@ class Train:
         from kornia_tidy.training.lightning_extra import require_lightning
 
         require_lightning()
+        import torch
+
         from kornia_tidy.cli.commands.report import tell
         from kornia_tidy.training.callbacks import BEST, LAST
         from kornia_tidy.training.design_folder import designed_camera
         from kornia_tidy.training.run import SETTINGS, train
 
         machine, folder = self.machine, Path(self.output)
+        if machine.accelerator == "gpu" and not (torch.cuda.is_available() or torch.backends.mps.is_available()):
+            raise ValueError("--accelerator gpu: PyTorch finds no GPU here")
         if (started := os.environ.get("WORLD_SIZE", str(machine.devices))) != str(machine.devices):
             raise ValueError(
                 f"--devices must be the number of processes that torchrun started, WORLD_SIZE={started}, got "

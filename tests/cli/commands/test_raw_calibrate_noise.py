@@ -42,6 +42,7 @@ class TestCalibrateNoise(BaseTester):
         [
             (["2.dng", "-o", "none/n.json"], "there is no folder none"),
             (["2.dng", "-o", "2.dng"], "cannot write 2.dng: it is an input"),
+            (["2.dng", "./2.dng", "-o", "n.json"], "./2.dng is given twice, and each capture counts once"),
             (["2.dng", "-o", "n.json", "--plot", "n.bmp"], "the suffix of a plot must be one of '.png'"),
             (["2.dng", "missing.dng", "-o", "n.json"], "missing.dng"),
             (["2.dng", "4.dng", "-o", "n.json"], "every exposure needs two captures or more"),

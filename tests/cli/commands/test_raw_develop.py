@@ -117,4 +117,5 @@ class TestRawDevelop(BaseTester):
         before = (tmp_path / "scan.tif").read_bytes()
         command = ["raw", "develop", str(tmp_path / "scan.tif"), "-o", str(tmp_path), "--format", "tiff"]
         assert "it is an input" in refused(command)
+        assert "it is not a folder" in refused([*command[:4], str(tmp_path / "scan.tif")])
         assert (tmp_path / "scan.tif").read_bytes() == before

@@ -61,6 +61,9 @@ class TestSimulate(BaseTester):
             (["--lens", "lens"], "--lens must be one of 'double-gauss-50mm'"),
             (["--lens", "own.safetensors", "--fit-depth"], "own.safetensors has its own: leave out --fit-depth"),
             (["--lens", "single-50mm", "--psfs", "bank"], "leave out --lens"),
+            (["--masks", "five"], "--masks is a number or a file (.npy, .safetensors): there is no file five"),
+            (["-o", ""], "--output must be a name, got an empty one"),
+            (["-o", 300 * "x" + ".png"], "xxx...: the name is too long"),
         ],
     )
     def test_exception_of_a_lens(self, scene, words, sentence, refused):

@@ -104,6 +104,7 @@ class TestTrain(BaseTester):
             (["--captures", "x"], "--captures is for --learn network or refiner, got --learn both"),
             (["--size", "1000000"], "the scene has 1000000 x 1000000 pixels, more than 268435456"),
             (["--batch", "8"], "4 scenes do not fill a batch of 8"),
+            *([] if torch.cuda.is_available() else [(["--accelerator", "gpu"], "PyTorch finds no GPU here")]),
             (["--head-from", "none.safetensors"], "cannot read none.safetensors: there is no such file"),
             (["--electrons", "9", "2"], "electrons must be least and largest, got 9.0 and 2.0"),
             (["--design-from", "nowhere"], "nowhere/report.json"),
