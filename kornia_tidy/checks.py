@@ -40,8 +40,10 @@ def check_not_negative(name: str, value: float, unit: str = "") -> None:
 
 
 def check_number(name: str, value: Any, unit: str = "") -> None:
-    """Raise ``TypeError`` unless ``value`` is a single number."""
-    if isinstance(value, str) or not hasattr(value, "__float__") or math.prod(getattr(value, "shape", ())) != 1:
+    """Raise ``TypeError`` unless ``value`` is a single number; NumPy's arrays with axes are none."""
+    shape = getattr(value, "shape", ())
+    axes = math.prod(shape) != 1 or (shape and not hasattr(value, "requires_grad"))
+    if isinstance(value, str) or not hasattr(value, "__float__") or axes:
         raise TypeError(f"{name} must be a number{' in ' + unit if unit else ''}, got {described(value)}")
 
 
@@ -144,7 +146,8 @@ def check_float_tensor(name: str, value: Any, rank: int, layout: str) -> None:
     import torch  # noqa: PLC0415
 
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+        remedy = ": torch.from_numpy makes one" if type(value).__name__ == "ndarray" else ""
+        raise TypeError(f"{name} must be a torch.Tensor, got {type(value).__name__}{remedy}")
     if value.layout != torch.strided or value.is_nested:
         layout = "nested" if value.is_nested else value.layout
         raise TypeError(f"{name} must be a dense tensor, got a {layout} one: convert it, as to_dense() does")
@@ -184,9 +187,11 @@ def _as_float(name: str, value: Tensor) -> str:
 
 
 def check_finite(name: str, value: Tensor) -> None:
-    """Raise ``ValueError`` if a value is NaN or infinite. Waits for the device."""
+    """Raise ``ValueError`` if a value is not finite, ``TypeError`` if complex or of 8 bits. Waits for the device."""
     import torch  # noqa: PLC0415
 
+    if value.is_complex() or (value.is_floating_point() and value.element_size() < 2):
+        raise TypeError(f"{name} must be real numbers of 16 bits or more, got {value.dtype}")
     if not value.numel():
         return
     check_values(name, value)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Integral
 
-from kornia_tidy.checks import check_choice, check_part, check_positive
+from kornia_tidy.checks import check_choice, check_count, check_number, check_part, check_positive
 
 LAYERS = ("nearest", "linear", "cubic", "bandlimited")
 WIDEST_WINDOW = 4095  # pixels; a PSF of three colours then takes 0.19 GiB
@@ -129,12 +130,16 @@ class Fidelity:
         check_positive("pixel_tolerance", self.pixel_tolerance)
         check_positive("field_tolerance", self.field_tolerance)
         check_positive("layer_spacing", self.layer_spacing, "radians")
+        check_part("name", self.name, str, "a text")
+        for flag in ("double", "correlate"):
+            check_choice(flag, getattr(self, flag), (False, True))
+        check_number("enclosed_energy", self.enclosed_energy)
         if not 0 < self.enclosed_energy < 1:
             raise ValueError(f"enclosed_energy must be between 0 and 1, got {self.enclosed_energy}")
-        if self.wavelengths is not None and self.wavelengths < 1:
-            raise ValueError(f"wavelengths must be at least 1, got {self.wavelengths}")
+        if self.wavelengths is not None:
+            check_count("wavelengths", self.wavelengths)
         for name, side in (("window", self.window), ("max_window", self.max_window)):
-            if side is not None and (side < 1 or side % 2 == 0):
+            if side is not None and (not isinstance(side, Integral) or side < 1 or side % 2 == 0):
                 raise ValueError(f"{name} must be an odd number of pixels, got {side}")
             if side is not None and side > WIDEST_WINDOW:
                 raise ValueError(

@@ -35,6 +35,8 @@ class TestFidelity(BaseTester):
             ("layer_spacing", -1.0),
             ("enclosed_energy", 1.0),
             ("wavelengths", 0),
+            ("wavelengths", 2.5),
+            ("correlate", "no"),
             ("window", 22),
             ("max_window", 0),
             ("window", 100001),

@@ -46,5 +46,9 @@ def camera_of_state(state: Mapping[str, Tensor]) -> TiDyOptics:
     paper = parts["fidelity"].propagation == "paper"
     with torch.random.fork_rng(devices=[]):
         camera = TiDyOptics(masks_of_state(state), color_space="paper" if paper else "srgb", **parts)
-    camera.load_state_dict(state, take_over=True)
+    try:
+        camera.load_state_dict(state, take_over=True)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"the camera's state does not fit its settings: {reason:.300}") from error
     return camera

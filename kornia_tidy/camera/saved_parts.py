@@ -116,6 +116,9 @@ def part_of(name: str, settings: Mapping[str, Any], state: Mapping[str, Tensor])
     """
     weights = below(state, f"{name}.")
     try:
+        for key, value in weights.items():
+            if not value.is_floating_point() or value.element_size() < 2:
+                raise TypeError(f"{key} must be floating point of 16 bits or more, got {value.dtype}")
         if name == "masks":
             _check_limits(settings[name])
         with torch.random.fork_rng(devices=[]):
@@ -147,6 +150,8 @@ def _made(described: Any, weights: Mapping[str, Tensor], pixels: tuple[int, ...]
     if kind is Material:
         given["dispersion"] = DISPERSIONS[described["dispersion"]]
     if issubclass(kind, PhaseMasks | LearnableDwellTimes):
+        if not weights and kind is not masks.NoMask:
+            raise ValueError("it has no weights")
         given |= kind.arguments_of(weights)
     if issubclass(kind, PhaseMasks):
         _check_tables(weights, pixels)

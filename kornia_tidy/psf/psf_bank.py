@@ -12,11 +12,12 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from kornia_tidy.checks import check_choice, check_finite, check_number, described
+from kornia_tidy.checks import check_choice, check_finite, check_float_tensor, check_number, described
 from kornia_tidy.files import error_prefix, write_bytes
 from kornia_tidy.tensor_files import read_tensors
 
 STRAY_LIGHT = ("renormalize", "veil", "discard")
+MOST_LIGHT = 10.0  # of a PSF; a sum above is of counts, not of shares
 TAILS = 1e-3  # of a PSF's light, see BankOfPSFs.with_tails
 
 
@@ -32,6 +33,10 @@ class BankOfPSFs:
     defocus: Tensor
 
     def __post_init__(self) -> None:
+        for name in (part.name for part in fields(self)):
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) and (value is not None or name != "veil"):
+                raise TypeError(f"{name} must be a torch.Tensor, got {described(value)}: torch.as_tensor makes one")
         shape = tuple(self.psfs.shape)
         if len(shape) != len(self.axes) + 2 or shape[-2] != shape[-1] or shape[-1] % 2 == 0 or 0 in shape:
             raise ValueError(f"psfs must have shape ({', '.join(self.axes)}, P, P) with P odd, got {shape}")
@@ -47,8 +52,9 @@ class BankOfPSFs:
         PSFs of one place may not be negative either. Between measured places a thin plate may undershoot.
 
         Raises:
-            TypeError: if a tensor is complex or holds integers.
-            ValueError: if a value is NaN or infinite, no PSF holds light, one is negative, or nodes do not ascend.
+            TypeError: if a tensor is complex, of 8 bits or holds integers.
+            ValueError: if a value is NaN or infinite, no PSF holds light or one far more than its point has, one or its
+                energy is negative, energy is 0 where a PSF holds light, or nodes do not ascend.
 
         Example:
             >>> PSFBank(-torch.ones(1, 1, 1, 1), torch.zeros(1), torch.ones(1, 1)).check()
@@ -66,6 +72,17 @@ class BankOfPSFs:
             raise ValueError(f"psfs must not be negative, got {lowest}")
         if not highest > 0:
             raise ValueError("psfs must hold some light, got none that is above 0")
+        energy, lost = (getattr(self, name) for name in ("energy", "veil"))
+        if bool(((energy < 0) | ((energy == 0) & (self.psfs.amax((-2, -1)) > 0))).any()):
+            raise ValueError(f"energy must be positive where psfs hold light, got {float(energy.min())}")
+        light = float(self.psfs.sum((-2, -1)).max())
+        if light > MOST_LIGHT * max(1.0, float(energy.max())):
+            raise ValueError(
+                f"psfs must be shares of the light of their points, got a sum of {light:.3g}: "
+                f"PSFBank.from_measured scales them"
+            )
+        if lost is not None and not bool(((lost >= 0) & (lost <= 1)).all()):
+            raise ValueError(f"veil must lie from 0 to 1, got {float(lost.min())} to {float(lost.max())}")
 
     def present(self) -> dict[str, Tensor]:
         """Return the tensors by their names."""
@@ -265,6 +282,7 @@ class PSFBank(BankOfPSFs):
         Raises:
             ValueError: if a value is negative or not finite, a PSF holds no light, or the nodes do not ascend.
         """
+        check_float_tensor("psfs", psfs, 4, "(D, C, P, P)")
         total = psfs.sum((-2, -1))
         cls(psfs, defocus, total).check()
         if not bool((total > 0).all()):

@@ -56,7 +56,7 @@ from kornia_tidy.psf.lens_limits import (
 )
 from kornia_tidy.psf.measured_field import measured_nodes
 from kornia_tidy.psf.paper import PAPER_SIZE, paper_psf_bank, warn_if_aliased
-from kornia_tidy.psf.psf_bank import PSFBank, checked_nodes
+from kornia_tidy.psf.psf_bank import BankOfPSFs, PSFBank, checked_nodes
 from kornia_tidy.psf.psf_cache import MEMORY, nodes_around, values_of
 from kornia_tidy.psf.psf_ops import operator_psf_bank
 from kornia_tidy.psf.psf_window import FittedWindow, fitted_window
@@ -663,6 +663,7 @@ class PSFModel:
             >>> model.window, torch.equal(model.psf_bank().psfs, measured.psfs)
             (5, True)
         """
+        check_part("bank", bank, BankOfPSFs, "a PSFBank or a FieldBank, such as PSFBank.load reads")
         bank.check()
         cut = bool((bank.psfs == 0).any())
         mean = self.replace(fidelity=self.fidelity.replace(occlusion_states="mean"))

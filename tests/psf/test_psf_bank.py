@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import os
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -97,17 +98,20 @@ class TestPSFBank(BaseTester):
             PSFBank.load(path)
 
     @pytest.mark.parametrize(
-        ("psfs", "defocus", "message"),
+        ("psfs", "energy", "nodes", "message"),
         [
-            (-torch.ones(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must not be negative, got -1.0"),
-            (torch.zeros(2, 3, 5, 5), torch.tensor([0.0, 1.0]), "psfs must hold some light"),
-            (torch.ones(2, 3, 5, 5).long(), torch.tensor([0.0, 1.0]), "psfs must be real .* got torch.int64"),
-            (torch.ones(2, 3, 5, 5) * torch.nan, torch.tensor([0.0, 1.0]), "psfs must be finite, got nan"),
-            (torch.ones(2, 3, 5, 5), torch.tensor([1.0, 0.0]), r"defocus must ascend, got \[1.0, 0.0\]"),
+            (-torch.ones(2, 3, 5, 5), 1.0, [0.0, 1.0], "psfs must not be negative, got -1.0"),
+            (torch.zeros(2, 3, 5, 5), 1.0, [0.0, 1.0], "psfs must hold some light"),
+            (torch.ones(2, 3, 5, 5).long(), 1.0, [0.0, 1.0], "psfs must be real .* got torch.int64"),
+            (torch.ones(2, 3, 5, 5).to(torch.float8_e5m2), 1.0, [0.0, 1.0], "psfs must be real numbers of 16 bits"),
+            (torch.ones(2, 3, 5, 5) * torch.nan, 1.0, [0.0, 1.0], "psfs must be finite, got nan"),
+            (torch.ones(2, 3, 5, 5) * 1e3, 1.0, [0.0, 1.0], r"psfs must be shares of .* got a sum of 2.5e\+04"),
+            (torch.ones(2, 3, 5, 5), 1.0, [1.0, 0.0], r"defocus must ascend, got \[1.0, 0.0\]"),
+            (torch.ones(2, 3, 5, 5), 0.0, [0.0, 1.0], "energy must be positive where psfs hold light, got 0.0"),
         ],
     )
-    def test_exception_files_and_banks_of_no_light(self, psfs, defocus, message, tmp_path):
-        made = PSFBank(psfs, defocus, torch.ones(2, 3))
+    def test_exception_files_and_banks_of_no_light(self, psfs, energy, nodes, message, tmp_path):
+        made = PSFBank(psfs, torch.tensor(nodes), torch.full((2, 3), energy))
         made.save(tmp_path / "bank.safetensors")
         with pytest.raises((TypeError, ValueError), match="cannot read .*" + message):
             PSFBank.load(tmp_path / "bank.safetensors")
@@ -165,10 +169,12 @@ class TestPSFBank(BaseTester):
             (torch.full((2, 1, 3, 3), torch.nan), torch.tensor([0.0, 1.0]), "finite"),
             (torch.zeros(2, 1, 3, 3), torch.tensor([0.0, 1.0]), "must hold some light"),
             (torch.ones(2, 1, 3, 3), torch.tensor([1.0, 0.0]), "ascend"),
+            (np.ones((2, 1, 3, 3)), torch.tensor([0.0, 1.0]), "psfs must be a .* torch.from_numpy makes one"),
+            (torch.ones(2, 1, 3, 3), [0.0, 1.0], "defocus must be a torch.Tensor, got a list"),
         ],
     )
     def test_exception_measured(self, psfs, defocus, message):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((TypeError, ValueError), match=message):
             PSFBank.from_measured(psfs, defocus)
 
 

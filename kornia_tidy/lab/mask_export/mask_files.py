@@ -14,7 +14,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from kornia_tidy.camera.saved_parts import masks_of_state, modulator_of_state
-from kornia_tidy.checks import check_choice
+from kornia_tidy.checks import check_choice, check_float_tensor
 from kornia_tidy.data.npy import decode_npy, encode_npy
 from kornia_tidy.files import error_prefix, read_bytes, write_bytes
 from kornia_tidy.lab.mask_export.slm_frames import checked_heights
@@ -131,8 +131,9 @@ def masks_in_state(state: Mapping[str, Tensor], material: Material | None = None
     material = constant_index(1.5) if material is None else material
     learnt = [v for key, v in state.items() if key.startswith("modulator.") and key.endswith("logits")]
     dwell = learnt[0].double().softmax(0).tolist() if learnt else None
-    heights = state[names[0]].double() / metres_to_radians(material)
-    return SavedMasks(checked_heights(heights[None] if heights.ndim == 2 else heights), material, None, dwell)
+    phase = state[names[0]][None] if state[names[0]].ndim == 2 else state[names[0]]
+    check_float_tensor(names[0], phase, 3, "(K, rows, columns)")
+    return SavedMasks(checked_heights(phase.double() / metres_to_radians(material)), material, None, dwell)
 
 
 def _dwell_shares(modulator: nn.Module) -> list[float] | None:
@@ -165,12 +166,14 @@ def read_heights(path: str | os.PathLike[str], material: Material | None = None)
     """
     path = Path(path)
     check_choice("the suffix of a file of masks", path.suffix.lower(), SUFFIXES)
-    with error_prefix(f"cannot read {path}"):
+    with error_prefix(f"cannot read {path}", TypeError):
         if path.suffix.lower() != ".npy":
             return masks_in_state(read_tensors(path)[0], material).heights
         array = decode_npy(read_bytes(path))
         if array.dtype.kind != "f" or array.ndim not in (2, 3):
             raise ValueError(f"heights are floats in 2 or 3 axes, not {array.dtype} {array.shape}")
+        if array.dtype == np.float16:
+            raise ValueError("heights are floats of 32 or 64 bits: those of 16 have steps of 60 nm near zero")
         heights = torch.from_numpy(array.astype(np.float64))
         return checked_heights(heights[None] if heights.ndim == 2 else heights)
 

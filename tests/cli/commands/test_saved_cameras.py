@@ -201,6 +201,17 @@ class TestCameraOfState(BaseTester):
         with pytest.raises(ValueError, match="masks of 16384x16384 pixels must take at most"):
             camera_of_state(state)
 
+    def test_exception_weights(self):
+        state = TiDyOptics(PixelwiseMask(1), fidelity=FIDELITY).state_dict()
+        rest = {name: value for name, value in state.items() if name != "masks.phase"}
+        for weights, sentence in (
+            ({**rest, "masks.phase": state["masks.phase"].int()}, "phase must be floating point of 16 bits or more"),
+            ({**state, "other": torch.ones(1)}, "does not fit its settings: .*Unexpected key"),
+            (rest, "the masks of the camera's state cannot be made: it has no weights"),
+        ):
+            with pytest.raises(ValueError, match=sentence):
+                camera_of_state(weights)
+
     def test_exception_no_settings(self):
         with pytest.raises(ValueError, match="the state has no entry '_extra_state', only phase"):
             camera_of_state(PixelwiseMask(1).state_dict())

@@ -65,7 +65,10 @@ class TestMaskFiles(BaseTester):
         save_file(ZernikeMask(2).state_dict(), tmp_path / "z.safetensors")
         (tmp_path / "bad.safetensors").write_bytes(b"no tensors")
         (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+        (tmp_path / "lfs.npy").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
         np.save(tmp_path / "int.npy", np.ones((2, 2), int))
+        np.save(tmp_path / "half.npy", np.ones((2, 2), np.float16))
+        save_file({"phase": torch.ones(1, 2, 2).int()}, tmp_path / "int.safetensors")
         np.save(tmp_path / "nan.npy", np.full((2, 2), np.nan))
         np.save(tmp_path / "object.npy", np.array([{}]), allow_pickle=True)
         for name, sentence in {
@@ -74,7 +77,10 @@ class TestMaskFiles(BaseTester):
             "z.safetensors": "it has no 'masks.phase', only coefficients",
             "bad.safetensors": "cannot read .*bad.safetensors",
             "bad.npy": "cannot read .*bad.npy",
+            "lfs.npy": "cannot read .*lfs.npy: it is a pointer of Git LFS",
             "int.npy": r"heights are floats in 2 or 3 axes, not int64 \(2, 2\)",
+            "half.npy": "cannot read .*half.npy: heights are floats of 32 or 64 bits",
+            "int.safetensors": "cannot read .*: phase must be floating point, got torch.int32",
             "nan.npy": "cannot read .*nan.npy: heights must be finite metres",
             "object.npy": "cannot read .*object.npy",
         }.items():

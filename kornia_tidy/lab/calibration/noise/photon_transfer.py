@@ -13,13 +13,13 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from kornia_tidy.checks import check_number
+from kornia_tidy.checks import check_part, check_positive
 from kornia_tidy.files import error_prefix, parse_json, read_bytes, write_bytes
 from kornia_tidy.lab.calibration.noise.transfer_curve import (
     CurvePoint,
@@ -30,6 +30,7 @@ from kornia_tidy.lab.calibration.noise.transfer_curve import (
 )
 from kornia_tidy.lab.raw.capture import RawCapture
 from kornia_tidy.sensor.sensor import SensorNoise
+from kornia_tidy.settings import is_number
 
 FORMAT = "kornia_tidy.photon_transfer/1"
 ROUNDING = 1 / 12  # variance that rounding to whole counts adds
@@ -285,18 +286,23 @@ def read_json(path: str | os.PathLike[str]) -> PhotonTransfer:
         ValueError: if it is not a calibration of this format.
     """
     data = read_bytes(path)
-    with error_prefix(
-        f"{path} is not a readable noise calibration", ArithmeticError, AttributeError, KeyError, TypeError
-    ):
+    with error_prefix(f"{path} is not a readable noise calibration", ArithmeticError, TypeError):
         document = parse_json(data)
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"its format is not {FORMAT!r}")
+        _check_names(PhotonTransfer, document)
+        for name, kind in (("channels", dict), ("points", list), ("camera", str), ("method", str)):
+            check_part(name, document[name], kind, {dict: "an object", list: "a list", str: "a text"}[kind])
         channels = {str(name): _numbers(TransferLine, line) for name, line in document.pop("channels").items()}
         points = tuple(_numbers(CurvePoint, point) for point in document.pop("points"))
         line = _numbers(TransferLine, document.pop("line"))
+        for name in ("black", "white", "iso"):
+            if not (is_number(value := document[name]) and math.isfinite(value)) and (name, value) != ("iso", None):
+                raise ValueError(f"{name} must be a finite number, got {value!r:.80}")
         result = PhotonTransfer(line=line, channels=channels, points=points, **document)
-        if result.iso is not None:
-            check_number("iso", result.iso)
+        if not result.white > result.black:
+            raise ValueError(f"white must be above black, got {result.white:g} and {result.black:g}")
+        check_positive("gain", line.gain, "electrons a count")
         result.sensor_noise()
     return result
 
@@ -427,8 +433,19 @@ def _exposures(captures: Sequence[RawCapture], black: Tensor | None) -> list[lis
     return groups
 
 
-def _numbers(kind: type, entry: dict[str, Any]) -> Any:
+def _check_names(kind: Any, entry: Any) -> None:
+    """Raise ``ValueError`` unless an entry of JSON has the names of a dataclass."""
+    names = {part.name for part in fields(kind)}
+    if not isinstance(entry, dict):
+        raise ValueError(f"it must hold {', '.join(sorted(names))}, got {entry!r:.80}")
+    for name in sorted(names ^ set(entry)):
+        told = "is missing" if name in names else "is none of them"
+        raise ValueError(f"it must hold {', '.join(sorted(names))}, and {name:.80} {told}")
+
+
+def _numbers(kind: type, entry: Any) -> Any:
     """Convert a JSON object to a dataclass, and raise if a field other than the channel's name is not a number."""
+    _check_names(kind, entry)
     for name, value in entry.items():
         if name != "channel" and (isinstance(value, bool) or not isinstance(value, (int, float))):
             raise ValueError(f"{name:.80} must be a number, got {value!r:.80}")
