@@ -44,7 +44,9 @@ def check_number(name: str, value: Any, unit: str = "") -> None:
     shape = getattr(value, "shape", ())
     axes = math.prod(shape) != 1 or (shape and not hasattr(value, "requires_grad"))
     if isinstance(value, str) or not hasattr(value, "__float__") or axes:
-        raise TypeError(f"{name} must be a number{' in ' + unit if unit else ''}, got {described(value)}")
+        raise TypeError(
+            f"{name} must be a number{' in ' + unit.removeprefix('in ') if unit else ''}, got {described(value)}"
+        )
 
 
 def check_count(name: str, value: int, least: int = 1, most: int | None = None) -> None:

@@ -87,8 +87,10 @@ def check_pixels(name: str, rows: int, columns: int) -> None:
         ...
         ValueError: the scene has 1000000 x 1000000 pixels, more than 268435456: set KORNIA_TIDY_MAX_PIXELS to allow it
     """
-    text = os.environ.get(VARIABLE, "")
-    most = int(text) if text.isascii() and text.isdigit() else LARGEST
+    text = os.environ.get(VARIABLE, "") or str(LARGEST)
+    if not (text.isascii() and text.isdigit()):
+        raise ValueError(f"{VARIABLE} must be a whole number of pixels, got {text!r:.80}")
+    most = int(text)
     if rows * columns > most:
         raise ValueError(f"{name} has {rows} x {columns} pixels, more than {most}: set {VARIABLE} to allow it")
 

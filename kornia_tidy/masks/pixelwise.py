@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from kornia_tidy.checks import check_choice, check_generator
+from kornia_tidy.checks import check_choice, check_generator, check_part
 from kornia_tidy.masks.base import (
     HEIGHTS,
     PhaseMasks,
@@ -74,6 +74,7 @@ class PixelwiseMask(PhaseMasks):
             phase = (heights.detach().double() * to_radians).to(torch.get_default_dtype())
         else:
             check_generator(generator)
+            check_part("initial", initial, str, "'noise', 'flat' or a torch.Tensor of heights in metres")
             check_choice("initial", initial, ("noise", "flat"))
             y, x = mask_axes(size)
             check_number_of_masks(num_masks, len(y) * len(x))

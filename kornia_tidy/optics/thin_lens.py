@@ -61,6 +61,8 @@ def _depth_range(value: tuple[float, float]) -> tuple[float, float]:
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != 2:
         raise TypeError(f"depth_range must be two numbers, (near, far) in metres, got {value!r}")
     near, far = value
+    for end in (near, far):
+        check_number("depth_range", end, "metres")
     if not 0 < near < far:
         raise ValueError(f"depth_range must be (near, far) with 0 < near < far in metres, got {(near, far)}")
     return near, far

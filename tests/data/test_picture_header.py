@@ -84,6 +84,9 @@ class TestCheckPixels(BaseTester):
         monkeypatch.setenv(VARIABLE, "100")
         with pytest.raises(ValueError, match="10 x 11 pixels, more than 100"):
             check_pixels("the scene", 10, 11)
+        monkeypatch.setenv(VARIABLE, "1e6")
+        with pytest.raises(ValueError, match="KORNIA_TIDY_MAX_PIXELS must be a whole number of pixels, got '1e6'"):
+            check_pixels("the scene", 10, 11)
         monkeypatch.setenv(VARIABLE, str(1 << 40))
         check_pixels("the scene", 10**6, 10**6)
 

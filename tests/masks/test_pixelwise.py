@@ -35,9 +35,11 @@ class TestPixelwiseMask(BaseTester):
         for material in (constant_index(1.5), FUSED_SILICA):
             self.assert_close(PixelwiseMask(initial=heights, material=material).heights(), heights, rtol=1e-6, atol=0)
 
-    @pytest.mark.parametrize("initial", ["nois", torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)])
+    @pytest.mark.parametrize(
+        "initial", ["nois", None, torch.zeros(3), torch.zeros(0, 4, 4), torch.full((4, 4), math.nan)]
+    )
     def test_exception_initial(self, initial):
-        with pytest.raises(ValueError, match="initial"):
+        with pytest.raises((TypeError, ValueError), match="initial"):
             PixelwiseMask(initial=initial)
 
     def test_feature_given_heights_come_back_within_a_constraint(self):

@@ -323,6 +323,7 @@ class TestLens(BaseTester):
         [
             ({"focal_length": "50 mm"}, "focal_length must be a number in metres, got '50 mm'"),
             ({"focus_distance": None}, "focus_distance must be a number in metres, got None"),
+            ({"depth_range": (0.5, None)}, "depth_range must be a number in metres, got None"),
             ({"depth_range": 5}, "depth_range must be two numbers, .near, far. in metres, got 5"),
             ({"lens_material": "PMMA"}, "lens_material must be a material such as .*, got 'PMMA'"),
         ],
