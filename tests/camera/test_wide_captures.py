@@ -168,7 +168,6 @@ class TestWideCaptures(BaseTester):
     @pytest.mark.parametrize(
         ("aperture", "tolerance"),
         [
-            ("triangle", 3e-3),
             ("thin ring", 3e-3),
             *(pytest.param(name, 3e-4, marks=pytest.mark.takes_seconds) for name in sorted(APERTURES)),
         ],

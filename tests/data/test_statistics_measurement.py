@@ -140,6 +140,7 @@ class TestDepthShares(BaseTester):
 
 @needs_data
 class TestPhotographs(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_published_numbers_are_those_of_half_a(self):
         """To the digits that are published."""
         from tests.benchmarks.scene_statistics import half_a

@@ -79,6 +79,7 @@ class TestRealLens(BaseTester):
         ideal = DesignTask(masks=1, focal_length=task.focal_length, depth_range=(0.5, 0.7))
         assert float(cost) > float(cost_of(ideal, search_lens(ideal, None, 14.0, 0.5), 14.0)[0]) + 0.1
 
+    @pytest.mark.takes_seconds
     def test_feature_masks_and_depth(self):
         task = DesignTask(masks=1, lens="single-50mm", depth_range=(0.5, 0.7), depth_weight=0.5)
         found = coded_candidate(task, "focal sweep", 20.0, 0.5, steps=2)

@@ -20,6 +20,12 @@ class TestMutualIntensityEnergies(OperatorTester):
         return mutual_intensity_energies(*random_case())
 
     @needs_compiler
+    @pytest.mark.takes_seconds
+    @pytest.mark.parametrize("seed", range(2))
+    def test_dynamo_passes_the_checks_of_operators(self, seed):
+        super().test_dynamo_passes_the_checks_of_operators(seed)
+
+    @needs_compiler
     def test_gradcheck_twice(self):
         case = [x.requires_grad_() for x in random_case()]
         assert torch.autograd.gradcheck(mutual_intensity_energies, case, fast_mode=True)
