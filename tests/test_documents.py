@@ -50,9 +50,9 @@ PUBLISHED_NETWORKS = {
     "zoedepth": "Intel/zoedepth-nyu",
 }  # made small in the folder, so that nothing is downloaded
 RUN, SHOWN = ("python", "bash"), ("text", "mermaid", "json", "bibtex")
-SLOW = [  # pages that take more than about three seconds; .ci/run runs each page, with its slow blocks
-    *(f"docs/{name}.md" for name in ("calibration", "command_line", "planning", "raw", "systems", "trained_systems")),
-    *(f"docs/{name}.md" for name in ("training", "when_coding_pays")),
+SLOW = [  # pages that take some seconds; .ci/run runs each page, with its slow blocks
+    *(f"docs/{name}.md" for name in ("calibration", "capture", "command_line", "planning", "raw", "start")),
+    *(f"docs/{name}.md" for name in ("systems", "trained_systems", "training", "when_coding_pays")),
     *(f"docs/guides/{name}.md" for name in ("capture_to_picture", "laboratory", "lens", "raw_files")),
 ]
 

@@ -148,6 +148,7 @@ class TestStore(BaseTester):
 
 
 class TestCommand(BaseTester):
+    @pytest.mark.takes_seconds
     def test_smoke_quick_writes_page_table_and_picture(self, tmp_path):
         command.main([str(tmp_path), "--quick"])
         text = (tmp_path / "results.md").read_text()

@@ -55,6 +55,7 @@ class TestCoDesign(BaseTester):
         assert design.words.startswith("two masks at f/")
         assert design.verdict.gain > 2 * design.verdict.standard_error
 
+    @pytest.mark.takes_seconds
     def test_feature_the_camera_is_the_recommended_one(self, bright):
         design, _ = bright
         optics = design.optics()

@@ -120,6 +120,7 @@ class TestOperatorPSFBank(BaseTester):
 
 class TestCompiledCamera(BaseTester):
     @pytest.mark.parametrize("compositing", ["gather", "scatter", "occlusion"])
+    @pytest.mark.takes_seconds
     def test_dynamo_another_scene_does_not_compile_again(self, compositing):
         """Nor do other depths and masks that have learnt."""
         optics = TiDyOptics(PixelwiseMask(2), fidelity="draft", compositing=compositing, sensor=None)

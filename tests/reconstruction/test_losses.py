@@ -74,6 +74,7 @@ class TestLosses(BaseTester):
         with pytest.raises(ValueError, match=r"at least one valid (pixel|pair of pixels .*), got a mask .* with none"):
             loss(maps, maps, torch.zeros(2, 1, 4, 5, dtype=torch.bool, device=device))
 
+    @pytest.mark.takes_seconds
     def test_dynamo_one_graph_and_an_empty_mask_has_no_loss(self, loss, device):
         compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
         prediction, target, mask = make_maps(device=device, dtype=torch.float32)

@@ -24,6 +24,7 @@ def untrained(**settings):
 
 class TestModelCard(BaseTester):
     @pytest.mark.parametrize("name", PRETRAINED)
+    @pytest.mark.takes_seconds
     def test_smoke_sections_of_each_shipped_system(self, name):
         card = model_card(shipped(name)._replace(record=pretrained_record(name)), name, "apache-2.0")
         assert re.findall(r"^## (.*)$", card, re.MULTILINE) == SECTIONS

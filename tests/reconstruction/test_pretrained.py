@@ -34,6 +34,7 @@ MEGABYTES = 25  # that all of them may take
 
 class TestPretrained(BaseTester):
     @pytest.mark.parametrize("name", PRETRAINED)
+    @pytest.mark.takes_seconds
     def test_feature_beats_its_capture_on_new_scenes(self, name):
         """The scores that heads.json tells, on other scenes than those it was measured on."""
         system = shipped(name)

@@ -217,6 +217,7 @@ class TestRuledClosedForm(BaseTester):
         assert (tiled - whole).abs().mean() < 2e-5
 
     @pytest.mark.parametrize("told", [False, True])
+    @pytest.mark.takes_seconds
     def test_dynamo_settings_of_a_tile_in_a_graph_are_those_of_eager_runs(self, told, monkeypatch):
         """Eager runs tell a sensor's noise from another by its values, and a graph has none."""
         restore, light = ruled(), photo(24, 24)

@@ -241,6 +241,7 @@ class TestSettings(BaseTester):
             TrainingSettings(**change)
 
     @pytest.mark.parametrize("name", PRETRAINED)
+    @pytest.mark.takes_seconds
     def test_feature_a_checkpoint_tells_the_settings_of_its_run(self, name):
         stored = json.loads(json.dumps(read_state(FOLDER / f"{name}.safetensors")["settings"]))
         settings = json.loads(json.dumps(TrainingSettings.of(shipped(name)).as_dict()))

@@ -47,6 +47,7 @@ class TestInfo(BaseTester):
         assert all(text.endswith(".so") for text in topics["kernel"])
 
     @pytest.mark.skipif(compiled.build(gather_ops.SOURCE, torch.float32).library is None, reason="no C compiler")
+    @pytest.mark.takes_seconds
     def test_feature_libraries_that_were_removed_meanwhile(self, capsys, tmp_path, monkeypatch):
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         monkeypatch.setattr(report, "SOURCES", report.SOURCES[-1:])

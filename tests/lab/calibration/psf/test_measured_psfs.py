@@ -77,6 +77,7 @@ def measured(images):
 
 
 class TestMeasurePSFs(BaseTester):
+    @pytest.mark.takes_seconds
     def test_feature_noisy_captures_give_the_psfs_to_two_percent(self, measured, truth):
         error = (measured.bank.psfs - truth).abs().sum((2, 3))
         assert float(error.max()) < 0.02
