@@ -97,5 +97,5 @@ def sensor_of(light: torch.Tensor) -> SensorNoise:
     if found is None:
         return SensorNoise(0.01)
     if found.rise <= 0:
-        return SensorNoise(max(LEAST_NOISE, found.std(float(light.mean()))))
+        return SensorNoise(max(LEAST_NOISE, found.std(float(light.nanmedian()))))
     return SensorNoise(max(LEAST_NOISE, found.std(0.0)), full_well=1 / found.rise)

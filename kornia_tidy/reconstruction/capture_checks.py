@@ -12,7 +12,10 @@ from torch.nn import functional
 from kornia_tidy.reconstruction.clipped_light import CLIPPED
 
 BEYOND = 6.0  # standard deviations of the noise beyond all neighbours
-CONTRAST = 0.5  # of the range of the neighbours, beyond them: no lens draws a point so much sharper than its surround
+CONTRAST = 0.5  # of the range of the neighbours, beyond them: few points of a scene are so much sharper than that
+SHARED = 0.25  # of an outlier's excess, in another colour: a point of the scene has several, a hot pixel has one
+SHARPER = 2.0  # than PSFs at the nodes of depth: a point between them
+STUCK = 0.1  # least softness of a point at zero or full scale, where most hot and dead pixels are
 ROWS = 256  # that are worked on together
 BLOCK = 8  # px of a square in which noise is measured, and of JPEG's blocks
 DARKEST_SQUARES = 0.05  # share of the squares of a light level: those of least variance show only noise
@@ -22,6 +25,7 @@ HALF_NORMAL = 0.6745  # of a standard deviation: median of absolute values
 LEAST_OF_EVEN = 0.499  # of the variance: median of the least twentieth of squares, counted on 62,500 of white noise
 LARGEST = 2048  # px, side of the middle of a picture in which noise is measured
 JPEG = 1.1  # least factor of blocks: 1.00 to 1.03 without compression, 1.27 and more at a quality of 92
+QUIETER = 0.9  # of the stated noise: JPEG leaves up to .85 of it, undisturbed captures have .94 and more
 JPEG_NOISE = 0.006  # of even noise: of .0045, .006 and .008 the best for a quality of 92, half A behind five cameras
 FALLING = -0.2  # of the variance in the dark for full light: noise of light rises with it, in encoded pictures it falls
 TWICE = 2.0  # a stated noise is doubted beyond this factor
@@ -43,17 +47,20 @@ class Repaired(NamedTuple):
     """Pixels of a colour that were repaired."""
 
 
-def repair_outliers(light: Tensor, noise: MeasuredNoise) -> Repaired:
+def repair_outliers(light: Tensor, noise: MeasuredNoise, softness: float = math.inf) -> Repaired:
     r"""Replace pixels that differ from all of their neighbours by more than noise does, such as hot and dead ones.
 
     A pixel is an outlier if it is beyond the largest or smallest of its eight neighbours by six standard deviations of
     the noise, and by half of the neighbours' range. What takes its place is half the sum of the four beside it less a
     quarter of that of the corners, exact where light is linear or quadratic along rows and columns, between the second
-    lowest and the second highest of them. Borders are reflected.
+    lowest and the second highest of them. Borders are reflected. What two colours show, or the only one, is a point of
+    the scene if it is as soft as the camera draws points, such as a star.
 
     Args:
         light: (C, H, W) linear light, at least 2 x 2 pixels.
         noise: of the capture, such as :func:`measure_noise` finds.
+        softness: least of the camera's points, see :func:`least_softness`. Default: outliers are repaired in all
+            colours.
 
     Example:
         >>> light = torch.full((1, 5, 5), 0.5)
@@ -68,16 +75,45 @@ def repair_outliers(light: Tensor, noise: MeasuredNoise) -> Repaired:
         rows = torch.arange(top - 1, min(top + ROWS, height) + 1).abs()
         rows = torch.where(rows < height, rows, 2 * height - 2 - rows)
         part = functional.pad(light[:, rows], (1, 1), "reflect")
-        repaired, place = _repaired(part, noise)
-        if len(place[0]):
+        repaired, shared, place = _repaired(part, noise)
+        color, row, column = place
+        own = light[color, row + top, column]
+        least = torch.where((own <= 0) | (own >= CLIPPED), max(softness, STUCK), softness / SHARPER)
+        hot = ~shared | (_softness(light, color, row + top, column) < least)
+        if hot.any():
             whole = light.clone() if whole is light else whole
-            whole[:, top : top + ROWS][place] = repaired
-            count += len(place[0])
+            whole[color[hot], row[hot] + top, column[hot]] = repaired[hot]
+            count += int(hot.sum())
     return Repaired(whole, count)
 
 
-def _repaired(part: Tensor, noise: MeasuredNoise) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Return the values that take the place of outliers in rows with a border of one pixel, and their places."""
+def least_softness(psfs: Tensor) -> float:
+    """Return by how much the sharpest PSF raises the pixels around its peak, in parts of the peak.
+
+    Args:
+        psfs: (..., P, P).
+
+    Example:
+        >>> least_softness(torch.tensor([[0.0, 1.0, 0.0], [1.0, 4.0, 1.0], [0.0, 1.0, 0.0]]))
+        0.125
+    """
+    padded = functional.pad(psfs.detach().reshape(-1, *psfs.shape[-2:]), (2, 2, 2, 2))
+    sharpest = torch.unravel_index(padded.argmax(), padded.shape)
+    return float(_softness(padded, *(index[None] for index in sharpest)))
+
+
+def _softness(light: Tensor, color: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Return the mean of the eight pixels around each over the pixel itself, both beyond the sixteen around them."""
+    steps = torch.arange(-2, 3, device=light.device)
+    rows = (row[:, None, None] + steps[:, None]).clamp(0, light.shape[1] - 1)
+    square = light[color[:, None, None], rows, (column[:, None, None] + steps).clamp(0, light.shape[2] - 1)]
+    own, three, five = square[:, 2, 2], square[:, 1:4, 1:4].sum((1, 2)), square.sum((1, 2))
+    base = (five - three) / 16
+    return ((three - own) / 8 - base) / (own - base)
+
+
+def _repaired(part: Tensor, noise: MeasuredNoise) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]:
+    """Return what takes the place of outliers in rows with a border of one pixel, which several colours show, where."""
     height, width = part.shape[-2] - 2, part.shape[-1] - 2
     moves = [(down, across) for down in range(3) for across in range(3) if (down, across) != (1, 1)]
     around = [part[:, down : down + height, across : across + width] for down, across in moves]
@@ -87,13 +123,14 @@ def _repaired(part: Tensor, noise: MeasuredNoise) -> tuple[Tensor, tuple[Tensor,
         torch.maximum(highest, other, out=highest)
         torch.minimum(lowest, other, out=lowest)
     deviation = (noise.dark + noise.rise * highest).clamp(min=0).sqrt()
-    margin = torch.maximum(BEYOND * deviation, CONTRAST * (highest - lowest))
-    place = ((own > highest + margin) | (own < lowest - margin)).nonzero(as_tuple=True)
+    beyond = torch.maximum(own - highest, lowest - own)
+    place = (beyond > torch.maximum(BEYOND * deviation, CONTRAST * (highest - lowest))).nonzero(as_tuple=True)
+    shared = (beyond[:, place[1], place[2]] > SHARED * beyond[place]).sum(0) >= min(2, len(part))
     found = torch.stack([other[place] for other in around])
     pairs = found[:4] + found[4:].flip(0)  # opposite neighbours, so that a picture that lies is repaired alike
     beside, corners = pairs[1] + pairs[3], pairs[0] + pairs[2]
     ordered = found.sort(0).values
-    return ((2 * beside - corners) / 4).clamp(ordered[1], ordered[-2]), place
+    return ((2 * beside - corners) / 4).clamp(ordered[1], ordered[-2]), shared, place
 
 
 class WithoutBands(NamedTuple):
@@ -286,13 +323,14 @@ class CheckedCapture(NamedTuple):
     """What a network should take the noise for at least, by its standard deviation: more than the sensor's for JPEG."""
 
 
-def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCapture:
+def check_capture(light: Tensor, told: MeasuredNoise | None = None, softness: float = math.inf) -> CheckedCapture:
     """Repair the outliers of a capture, and compare its noise with the stated noise.
 
     Args:
         light: (C, H, W) linear light.
         told: the stated noise, with which the capture will be restored. Outliers exceed both it and the measured one.
             None: nothing is compared.
+        softness: see :func:`repair_outliers`.
 
     Example:
         >>> light = 0.5 + 0.01 * torch.randn(3, 128, 128, generator=torch.Generator().manual_seed(0))
@@ -306,10 +344,10 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
     if noise is None:
         return CheckedCapture(light, None, ())
     notes = []
-    level = float(middle.mean())
+    level = float(middle.nanmedian())  # among the levels at which it was measured, also where few pixels have light
     found = noise.std(level)
     most = noise if told is None else MeasuredNoise(*map(max, noise, told))  # JPEG shows less than the sensor's
-    repaired = repair_outliers(light, most)
+    repaired = repair_outliers(light, most, softness)
     if repaired.count:
         notes.append(f"{repaired.count} outliers, such as hot pixels, were replaced from their neighbours")
     even = repair_bands(repaired.light, found)
@@ -325,7 +363,9 @@ def check_capture(light: Tensor, told: MeasuredNoise | None = None) -> CheckedCa
             f"its noise is {found:.2g} of full scale, {factor:.0f} times the stated noise: "
             f"--noise {found:.2g} or SensorNoise({found:.2g})"
         )
-    blocks = blockiness(middle) > JPEG
+    stated = found if told is None else told.std(level)
+    quieter = found < QUIETER * stated or math.isclose(found, stated, rel_tol=1e-3)  # or measured in this capture
+    blocks = quieter and blockiness(middle) > JPEG  # else the scene has blocks
     if blocks:
         notes.append(f"it shows the blocks of JPEG, taken for a noise of {JPEG_NOISE}: rather restore the raw file")
     elif noise.rise < FALLING * noise.dark:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -14,7 +15,7 @@ from kornia_tidy.optics.thin_lens import ThinLensCamera
 from kornia_tidy.psf.field_bank import FieldBank
 from kornia_tidy.psf.psf_bank import PSFBank
 from kornia_tidy.psf.psf_model import PSFModel
-from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
+from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture, least_softness
 from kornia_tidy.reconstruction.closed_form import NODES, ClosedForm
 from kornia_tidy.reconstruction.depth_distribution import depth_moments
 from kornia_tidy.reconstruction.head import takes_noise
@@ -29,6 +30,7 @@ from kornia_tidy.reconstruction.trained import TrainedSystem
 from kornia_tidy.reconstruction.whole_picture import whole_picture
 from kornia_tidy.sensor.sensor import SensorNoise
 
+MOST_LIGHT = 16.0  # of full scale; more is another unit
 FIELD_TILE = 384  # px, within which the PSFs of its middle serve; each tile costs a computation of kernels
 
 
@@ -157,7 +159,7 @@ def reconstruct_light(
 
     Raises:
         TypeError: if the light is not a floating-point tensor.
-        ValueError: if it is of another shape, or the network cannot be tiled within the memory.
+        ValueError: if it is of another shape or unit, or the network cannot be tiled within the memory.
 
     Convention:
         Gradients are not computed.
@@ -165,7 +167,13 @@ def reconstruct_light(
     check_float_tensor("light", light, 3, "(3, H, W) or (1, H, W)")
     if light.shape[0] not in {1, 3} or 0 in light.shape:
         raise ValueError(f"light must have shape (3, H, W) or (1, H, W), got {tuple(light.shape)}")
-    light, _, notes, least = check_capture(light, _told_noise(head))
+    if (most := float(light.max())) > MOST_LIGHT:
+        raise ValueError(
+            f"light must be in parts of full scale, at most {MOST_LIGHT:g}, got {most:.5g}: divide by full scale"
+        )
+    forms = [part for part in head.modules() if isinstance(part, ClosedForm)]
+    softness = min((least_softness(part.psfs) for part in forms), default=math.inf)
+    light, _, notes, least = check_capture(light, _told_noise(head), softness)
     head = _with_least_noise(head, least, float(light.mean()))
     colours = light.expand(3, -1, -1)[None]
     if head.field is not None:

@@ -18,6 +18,7 @@ from kornia_tidy.reconstruction.capture_checks import (
     MeasuredNoise,
     blockiness,
     check_capture,
+    least_softness,
     measure_noise,
     repair_bands,
     repair_outliers,
@@ -67,6 +68,17 @@ class TestRepairOutliers(BaseTester):
         marked, _ = with_outliers(light, 1e-3)
         whole, turned = (repair_outliers(part, told(sensor)).light for part in (marked, marked.transpose(1, 2)))
         assert torch.equal(whole, turned.transpose(1, 2))
+
+    @pytest.mark.parametrize(("colors", "count"), [((0, 1, 2), 0), ((1,), 1)])
+    def test_feature_points_of_the_scene_stay_and_those_of_one_color_do_not(self, colors, count):
+        psf = torch.tensor([[0.0, 0.02, 0.0], [0.02, 0.92, 0.02], [0.0, 0.02, 0.0]])  # behind a sharp lens
+        light = torch.full((3, 9, 9), 0.1)
+        light[list(colors), 3:6, 3:6] += 0.8 * psf
+        assert repair_outliers(light, MeasuredNoise(1e-6, 0.0), least_softness(psf)).count == count
+        assert repair_outliers(light, MeasuredNoise(1e-6, 0.0)).count == len(colors)  # behind an unknown lens
+        stuck = torch.full((3, 9, 9), 0.1)
+        stuck[:, 4, 4] = 1.0
+        assert repair_outliers(stuck, MeasuredNoise(1e-6, 0.0), least_softness(psf)).count == 3
 
     def test_feature_corners_have_neighbours(self):
         light = torch.full((1, 4, 4), 0.2)
@@ -154,6 +166,9 @@ class TestCheckCapture(BaseTester):
         assert checked.least_noise > float(sensor.std(light).mean())
         assert check_capture(light, told(sensor)).least_noise == 0
         assert blockiness(compressed[:, 3:, 5:]) > JPEG > blockiness(light)  # wherever the blocks begin
+        of_scene = sensor(jpeg(light, 50)[None], generator=torch.Generator().manual_seed(1))[0]
+        assert blockiness(of_scene) > JPEG
+        assert check_capture(of_scene, told(sensor)).least_noise == 0  # not the capture: its noise is whole
 
     @pytest.mark.takes_seconds
     def test_feature_jpeg_counts_as_noise_unless_more_is_told(self):

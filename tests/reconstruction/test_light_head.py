@@ -16,7 +16,7 @@ import kornia_tidy
 from kornia_tidy import SensorNoise, ThinLensCamera
 from kornia_tidy.data import dead_leaves
 from kornia_tidy.reconstruction.camera_system import any_camera_system
-from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture
+from kornia_tidy.reconstruction.capture_checks import MeasuredNoise, check_capture, least_softness
 from kornia_tidy.reconstruction.head_names import CLOSED_FORMS
 from kornia_tidy.reconstruction.light_head import LightHead, UncertainReconstruction, reconstruct_light, with_noise_of
 from kornia_tidy.reconstruction.settings import SystemSettings
@@ -133,7 +133,7 @@ class TestReconstructLight(BaseTester):
         light_head = LightHead(TrainedSystem(optics, head, settings, 0))
         found = reconstruct_light(light_head, light, memory_budget=1 << 20, progress=lambda *n: seen.append(n))
         told = MeasuredNoise(*head.closed_form.noise_model.tolist())
-        light = check_capture(light, told).light  # without outliers
+        light = check_capture(light, told, least_softness(head.closed_form.psfs)).light  # without outliers
         whole = head(optics.encode(light[None]))[0]
         assert len(seen) > 1
         # Roundings of float32, times the slope of sRGB in the dark, 12.92, and the filter's largest gain, 5.
@@ -179,9 +179,11 @@ class TestReconstructLight(BaseTester):
         _, depth = kornia_tidy.reconstruct(np.full((4, 5), 77, np.uint8), head)
         assert depth.shape == (4, 5)
 
-    def test_exception_names_the_shape(self):
+    def test_exception_names_the_shape_or_the_unit(self):
         with pytest.raises(ValueError, match=r"light must have shape \(3, H, W\) or \(1, H, W\), got \(2, 4, 4\)"):
             reconstruct_light(light_head("edof"), torch.rand(2, 4, 4))
+        with pytest.raises(ValueError, match="light must be in parts of full scale, at most 16, got 255: divide by"):
+            reconstruct_light(light_head("edof"), torch.full((3, 4, 4), 255.0))
 
 
 class TestPictures(BaseTester):

@@ -56,6 +56,8 @@ def fit_table(system: FirstOrder, wavelengths: tuple[float, ...], field: float, 
     crowding = _CROWDING if odd else 0.0
     known: dict[float, list[_Fitted]] = {}
     fit = None
+    rim = points[-DEGREE - 3 :]  # which a lens that is too fast loses, before all others are traced
+    wavefronts(system, wavelengths[0], field * mirrored_nodes(counts[0], crowding).numpy(), psi[:: DEPTHS - 1], rim)
     for count in counts:
         heights = [float(h) for h in mirrored_nodes(count, crowding) * field]
         if missing := [h for h in heights if h not in known]:
