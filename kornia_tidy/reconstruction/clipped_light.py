@@ -17,6 +17,7 @@ CLIPPED = 0.999  # of full scale: a pixel at or above it holds no more than that
 # that of no excess .232.
 NEARLY, HALFWAY, AMONG, COLORS, LEVEL, DOUBT, MOST = 3.77, 3.25, 0.405, 0.062, 0.016, 6.0, 0.5
 NEAR, WIDER, FAR = 1.5, 3.0, 6.0  # px, of Gaussian weights
+REACH = 15  # px, how far a pixel's neighbours reach
 LEAST = 1e-4  # of d: far from known pixels nothing is doubted
 
 
@@ -77,6 +78,9 @@ def _near(values: Tensor, sigma: float) -> Tensor:
     radius = round(2.5 * sigma)
     place = torch.arange(-radius, radius + 1, dtype=values.dtype, device=values.device)
     weights = (-0.5 * (place / sigma).square()).softmax(0)
-    padded = functional.pad(values.flatten(0, 1)[:, None], (radius,) * 4, "replicate")
-    rows = functional.conv2d(padded, weights[None, None, None])
-    return functional.conv2d(rows, weights[None, None, :, None]).view_as(values)
+    padded = functional.pad(values, (radius,) * 4, "replicate")
+    if Mode.GRAPH not in torch_mode():
+        padded = padded.contiguous(memory_format=torch.channels_last)  # a sixth of the time on a processor
+    count = values.shape[1]
+    rows = functional.conv2d(padded, weights.expand(count, 1, 1, -1), groups=count)
+    return functional.conv2d(rows, weights[:, None].expand(count, 1, -1, 1), groups=count)

@@ -341,6 +341,10 @@ class ClosedForm(nn.Module):
         """Return the width of the bilateral filter in colour."""
         return COLOR * 10 ** (COLOR_EXPONENT * _above(noise))
 
+    def completed(self, light: Tensor) -> Tensor:
+        """Return light with what is expected beyond full scale: here nothing."""
+        return light
+
     def _noise_of(self, light: Tensor) -> Tensor:
         """Return the standard deviation of the sensor's noise at light within [0, 1]."""
         dark, rise = self.noise_model.to(light.dtype)

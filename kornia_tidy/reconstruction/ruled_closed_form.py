@@ -192,6 +192,10 @@ class RuledClosedForm(ClosedForm):
         restored = self._restored(capture, light, found.noise.expand_as(capture), found.place, found.color)
         return restored._replace(maps=torch.cat([restored.maps, self._camera_maps(capture, found.noise)], 1))
 
+    def completed(self, light: Tensor) -> Tensor:
+        """Return light with what is expected beyond full scale, behind the noise of the sensor."""
+        return beyond_full_scale(light, self._noise_of(light).square().mean((1, 2, 3), keepdim=True).sqrt())
+
     def _smooth(self, image: Tensor, color: Tensor) -> Tensor:
         smoothed = bilateral_filter(image, color.clamp(min=COLORS[0]), WINDOW, SPACE)
         return torch.where(color > 0, smoothed, image)

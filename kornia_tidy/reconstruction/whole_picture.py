@@ -9,8 +9,11 @@ import torch
 from kornia.color import rgb_to_linear_rgb
 from torch import Tensor, nn
 
+from kornia_tidy.reconstruction.clipped_light import REACH
 from kornia_tidy.reconstruction.closed_form import ClosedForm
 from kornia_tidy.reconstruction.ruled_closed_form import RuledClosedForm, sampled_windows
+
+STRIP = 256  # rows, whose light is averaged at once
 
 
 @contextmanager
@@ -37,14 +40,11 @@ def whole_picture(head: nn.Module, picture: Tensor, *, encoded: bool = False) ->
     """
     parts = closed_forms_without_statistics(head)
     if parts:
-        strips = (strip.clamp(0, 1).double() for strip in picture.split(256, -2))  # a copy would take its memory again
-        sums = [(rgb_to_linear_rgb(strip) if encoded else strip).sum((-2, -1)) for strip in strips]
-        mean = torch.stack(sums).sum(0)[..., None, None] / (picture.shape[-2] * picture.shape[-1])
         windows = [part.clamp(0, 1) for part in sampled_windows(picture)]
         sample = [rgb_to_linear_rgb(part) if encoded else part for part in windows]
     try:
         for part in parts:
-            part.mean_light, part.sample = mean.to(part.psfs), sample
+            part.mean_light, part.sample = _mean_light(part, picture, encoded=encoded), sample
             if isinstance(part, RuledClosedForm):
                 part.remembered = {}
         yield
@@ -62,3 +62,14 @@ def closed_forms_without_statistics(head: nn.Module) -> list[ClosedForm]:
     """
     parts = [module for module in head.modules() if isinstance(module, ClosedForm)]
     return [part for part in parts if (part.has_stray_light or part.even_noise) and part.mean_light is None]
+
+
+def _mean_light(form: ClosedForm, picture: Tensor, *, encoded: bool) -> Tensor:
+    """Return the mean light of a picture, with what a closed form expects beyond full scale, (B, 3, 1, 1)."""
+    rows, sums, precise = picture.shape[-2], [], torch.promote_types(form.psfs.dtype, torch.float32)
+    for top in range(0, rows, STRIP):  # a copy of the picture would take its memory again
+        first = max(0, top - REACH)
+        strip = picture[..., first : top + STRIP + REACH, :].clamp(0, 1).to(form.psfs.device, precise)
+        light = form.completed(rgb_to_linear_rgb(strip) if encoded else strip)
+        sums.append(light[..., top - first : top - first + STRIP, :].double().sum((-2, -1)))
+    return (torch.stack(sums).sum(0)[..., None, None] / (rows * picture.shape[-1])).to(form.psfs)

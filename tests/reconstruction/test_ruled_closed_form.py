@@ -216,6 +216,14 @@ class TestRuledClosedForm(BaseTester):
         self.assert_close(tiled, whole, atol=2e-3, rtol=0)
         assert (tiled - whole).abs().mean() < 2e-5
 
+    def test_feature_the_mean_of_a_picture_counts_what_is_expected_beyond_full_scale(self):
+        restore, light = ruled(encoded=False), photo(600, 24)
+        light[..., 240:270, 4:20] = 1.0  # over the seam of two strips
+        with whole_picture(restore, light):
+            found = restore.mean_light
+        self.assert_close(found, restore.completed(light).mean((-2, -1), keepdim=True), rtol=1e-6, atol=0)
+        assert (found > light.mean((-2, -1), keepdim=True) + 0.002).all()
+
     @pytest.mark.parametrize("told", [False, True])
     @pytest.mark.takes_seconds
     def test_dynamo_settings_of_a_tile_in_a_graph_are_those_of_eager_runs(self, told, monkeypatch):
