@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HOSTS = {
     "arxiv.org": r"/abs/\d{4}\.\d{5}",
     "download.pytorch.org": r"/whl/cpu",
+    "git-lfs.github.com": r"/spec/",
     "horatio.cs.nyu.edu": r"/mit/silberman/.+\.mat",
     "lmb.informatik.uni-freiburg.de": r"/resources/datasets/\w+\.en\.html",
     "semver.org": r"/",

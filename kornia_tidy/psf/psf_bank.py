@@ -74,9 +74,9 @@ class BankOfPSFs:
             raise ValueError("psfs must hold some light, got none that is above 0")
         energy, lost = (getattr(self, name) for name in ("energy", "veil"))
         if bool(((energy < 0) | ((energy == 0) & (self.psfs.amax((-2, -1)) > 0))).any()):
-            raise ValueError(f"energy must be positive where psfs hold light, got {float(energy.min())}")
-        light = float(self.psfs.sum((-2, -1)).max())
-        if light > MOST_LIGHT * max(1.0, float(energy.max())):
+            raise ValueError(f"energy must be positive where psfs hold light, got {float(energy.detach().min())}")
+        light = float(self.psfs.detach().sum((-2, -1)).max())
+        if light > MOST_LIGHT * max(1.0, float(energy.detach().max())):
             raise ValueError(
                 f"psfs must be shares of the light of their points, got a sum of {light:.3g}: "
                 f"PSFBank.from_measured scales them"

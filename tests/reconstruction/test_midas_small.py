@@ -119,11 +119,14 @@ class TestLoadMiDaSSmall(BaseTester):
         with pytest.raises(ValueError, match=f"cannot read .*midas.pt: {sentence}"):
             load_midas_small(path)
 
-    @pytest.mark.parametrize("content", [b"version https://git-lfs.github.com/spec/v1", b"PK\x03\x04 cut short"])
-    def test_exception_names_a_file_that_is_something_else(self, content, tmp_path):
+    @pytest.mark.parametrize(
+        ("content", "sentence"),
+        [(b"version https://git-lfs.github.com/spec/v1", "a pointer"), (b"PK\x03\x04 cut", "must be a state dict")],
+    )
+    def test_exception_names_a_file_that_is_something_else(self, content, sentence, tmp_path):
         path = tmp_path / "midas.pt"
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"cannot read .*midas.pt: it must be a state dict"):
+        with pytest.raises(ValueError, match=f"cannot read .*midas.pt: it .*{sentence}"):
             load_midas_small(path)
 
     def test_exception_names_what_is_no_state_dict(self, tmp_path):

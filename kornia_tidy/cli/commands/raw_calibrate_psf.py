@@ -154,7 +154,6 @@ class CalibratePsf:
             if path is not None:
                 check_choice("the suffix of what to write", Path(path).suffix.lower(), (suffix,))
         inputs = [*self.files, *self.reference]
-        check_once([*self.files, *self.reference])
         check_outputs([self.output, picture, self.fit_mask], inputs)
         if len(set(self.distances)) != len(self.distances) or not min(self.distances) > 0:
             raise ValueError(f"--distances must be different metres above zero, got {self.distances}")
@@ -174,6 +173,7 @@ class CalibratePsf:
                 f"--reference needs one file for each of {places * len(self.distances)} places, got "
                 f"{len(self.reference)}"
             )
+        check_once(inputs)
 
     def _read(self, path: str, calibration: PhotonTransfer | None) -> Picture:
         """Read linear light (C, H, W) or, for a mosaic, the planes of its tile with their channels."""
