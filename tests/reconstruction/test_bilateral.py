@@ -35,6 +35,13 @@ class TestBilateralFilter(BaseTester):
         self.assert_close(found[..., :8], bilateral_filter(image, 0.1)[..., :8])
         self.assert_close(found[..., 8:], bilateral_filter(image, 0.6)[..., 8:])
 
+    @pytest.mark.parametrize("height", [65, 130])
+    def test_feature_strips_without_gradients_and_several_widths_are_the_whole(self, height):
+        image, colors = torch.rand(2, 3, height, 9, dtype=torch.float64), torch.rand(4, 2, 1, 1, 1) + 0.05
+        with torch.no_grad():
+            found = bilateral_filter(image, colors)
+        self.assert_close(found, torch.stack([bilateral_filter(image, c) for c in colors]), atol=1e-12, rtol=0)
+
     def test_gradcheck(self, device):
         widths = torch.full((1, 1, 1, 1), 0.3, dtype=torch.float64, requires_grad=True)
         image = noise(1, 2, 4, 5).requires_grad_()

@@ -47,6 +47,15 @@ class TestNAFNet(BaseTester):
         expected = y + block.gamma * linear(u[:, :32] * u[:, 32:], block.project2)
         self.assert_close(block(x), expected)
 
+    @pytest.mark.parametrize("height", [144, 528])  # of which strips of 16, 8 and 2 rows are left
+    def test_feature_strips_without_gradients_are_the_whole(self, height):
+        head, image = NAFNet(width=4, repeats=3).double(), torch.rand(2, 3, height, 16, dtype=torch.float64)
+        for parameter in head.parameters():
+            nn.init.normal_(parameter, std=0.3)  # blocks start as the identity
+        with torch.no_grad():
+            found = head(image)
+        self.assert_close(found, head(image), atol=1e-12, rtol=0)
+
     def test_feature_repeats_blocks_of_each_level_but_the_coarsest(self):
         once, twice = (NAFNet(width=4, repeats=repeats) for repeats in (1, 2))
         for part in ("encoder", "decoder"):
